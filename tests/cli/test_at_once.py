@@ -196,6 +196,7 @@ def test_json_of_render_names_the_pictures_that_were_actually_written(working_fo
     assert facts["pictures"] == ["out/0000-2.png", "out/0001.png"]
 
 
+@pytest.mark.acceptance
 def test_bench_keeps_files_that_appear_meanwhile_and_updates_the_current_page(working_folder, monkeypatch):
     words = import_module("hyrfpack.bench.tables")
     measure = import_module("hyrfpack.bench.suite").benchmark_model

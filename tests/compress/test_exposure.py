@@ -96,6 +96,7 @@ def test_with_a_map_fitted_gains_are_relative_to_the_map(model_file, scene, tmp_
     np.testing.assert_allclose(np.log(gains).mean(1), np.log(PHOTO_GAINS / MEAN_GAIN)[:, 0] / 2, atol=0.15)
 
 
+@pytest.mark.acceptance
 def test_finetuning_keeps_the_mean_exposure_and_its_note_in_the_file(
     model_file, file_without_exposure_note, scene, mean_exposure_views, tmp_path
 ):

@@ -60,6 +60,7 @@ def test_torch_uses_one_thread_inside_a_task() -> None:
     assert parallel_map(lambda _: torch.get_num_threads(), [0, 1]) == [1, 1]
 
 
+@pytest.mark.acceptance
 def test_torch_keeps_its_number_of_threads_outside_tasks() -> None:
     """The process is new, so that the pool's threads are the first that use torch."""
     script = (

@@ -95,7 +95,7 @@ def config_of(change: str) -> TrainConfig:
             "exposure": True,
             "density": WITH_ROUNDS,
             "max_gaussians": 30,
-            "steps": 8,
+            "steps": 6,
         },
         "random background colours": {"background": False, "background_color": "random"},
         "rounds of density control": {"density": WITH_ROUNDS, "max_gaussians": 30},
@@ -149,6 +149,7 @@ def test_rounds_of_density_control_end_graphs(gpu: torch.device, replays: list[i
     assert len(set(replays)) >= 2
 
 
+@pytest.mark.acceptance
 def test_a_graph_with_other_gradients_is_not_used(
     gpu: torch.device, replays: list[int], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
