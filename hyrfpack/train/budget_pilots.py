@@ -39,7 +39,7 @@ def measure_budget(pilots: ScenePilots, exposure: bool) -> tuple[float, str]:
     """
     fold = pilots.fold()
     if not fold.validation:
-        return 1.0, "masks leave nothing of the photos to judge by"
+        return 1.0, "masks leave no pixel of the validation photos"
     usual, small = fold.max_gaussians, round(SMALL_PILOT_BUDGET_RATIO * fold.max_gaussians)
     gains: list[float] = []
     # A second round confirms a gain that would make the budget smaller.

@@ -13,7 +13,7 @@ from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE
 from hyrfpack.progress import Progress
 from hyrfpack.scene import Scene
 from hyrfpack.train.log import TrainingLog
-from hyrfpack.train.results import Results, TrainingRecord, write_results
+from hyrfpack.train.results import Results, TrainingRecord, remove_if_possible, write_results
 
 _LOG = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ def finish_run(
     results = write_results(record, scene, out, config, device, progress, overwrite=overwrite)
     missing = _log_missing(results)
     if METRICS_FILE not in results.missing and owns_checkpoint:
-        (out / CHECKPOINT_FILE).unlink(missing_ok=True)
+        remove_if_possible(out / CHECKPOINT_FILE)
     if log is not None:
         facts = {name: results.metrics[name] for name in ("gaussians", "bytes")}
         scores = results.metrics.get("evaluation", {})

@@ -43,7 +43,7 @@ def measure_length(pilots: ScenePilots, exposure: bool, budget_factor: float | N
     lengths = pilot_lengths(pilots.config.steps)
     fold = pilots.fold(LENGTH_VALIDATION_EVERY)
     if not fold.validation:
-        return lengths[-1], "masks leave nothing of the photos to judge by"
+        return lengths[-1], "masks leave no pixel of the validation photos"
     scores: list[float] = []
     for number, length in enumerate(lengths, 1):
         config = dataclasses.replace(pilots.config, steps=length, budget_factor=budget_factor)

@@ -168,7 +168,7 @@ def save_model(trainer: Trainer, out: Path, progress: Progress, *, overwrite: bo
     try:
         name = Path(write_model(data, out / MODEL_FILE, overwrite=overwrite).file).name
     except HyrfError:
-        _remove(out / RECORD_FILE)
+        remove_if_possible(out / RECORD_FILE)
         raise
     if name != record.model:
         record = dataclasses.replace(record, model=name)
@@ -177,9 +177,9 @@ def save_model(trainer: Trainer, out: Path, progress: Progress, *, overwrite: bo
     if overwrite:
         # Results of an earlier run would be mistaken for those of this model.
         for result in (METRICS_FILE, CURVE_FILE, *_picture_files(scene)):
-            _remove(out / result)
+            remove_if_possible(out / result)
     if is_recorded and (overwrite or trainer.saved is not None):
-        _remove(out / CHECKPOINT_FILE)  # This also frees space for the results.
+        remove_if_possible(out / CHECKPOINT_FILE)  # This also frees space for the results.
     return record
 
 
@@ -244,7 +244,7 @@ def write_results(
         missing.append(METRICS_FILE)
         reasons.append(str(error))
     if not missing:
-        _remove(out / RECORD_FILE)
+        remove_if_possible(out / RECORD_FILE)
     return Results(metrics, tuple(missing), tuple(reasons))
 
 
@@ -271,7 +271,8 @@ def _picture_files(scene: Scene) -> list[str]:
     return [f"{VIEWS_FOLDER}/{name}" for name in picture_names(scene.test).values()]
 
 
-def _remove(path: Path) -> None:
+def remove_if_possible(path: Path) -> None:
+    """Remove a file if it exists. One that cannot be removed stays, so that results that are written count."""
     with suppress(OSError):
         path.unlink(missing_ok=True)
 

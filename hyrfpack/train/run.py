@@ -162,7 +162,8 @@ class _Run:
         if record is not None:
             return self._complete(record)
         if self.overwrite and not self.resume and self.ranks.is_main:
-            for name in (RECORD_FILE, BLOCKS_JOURNAL_FILE):  # These belong to the earlier run, which this one replaces.
+            # These belong to the earlier run, which this one replaces. They would be resumed if this one stopped early.
+            for name in (RECORD_FILE, BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE):
                 (self.out / name).unlink(missing_ok=True)
         decisions = self._decide()
         return TrainResult(False, 0, None, {}) if decisions is None else self._train(self._set_up(decisions), decisions)
@@ -246,9 +247,6 @@ class _Run:
         trainer.pilots = [dataclasses.asdict(score) for score in decisions.scores]
         if self.resume:
             trainer.load(self._checkpoint)
-        elif self.ranks.is_main and not self.ranks.is_single:
-            # Restarted processes resume from any checkpoint that they find, so that of an earlier run must not remain.
-            self._checkpoint.unlink(missing_ok=True)
         return trainer
 
     def _train(self, trainer: Trainer, decisions: Decisions) -> TrainResult:

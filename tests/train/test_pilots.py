@@ -178,7 +178,7 @@ def test_completely_masked_photos_are_no_validation_photos(left, monkeypatch):
     if left:
         assert judged == [judges[:1]] * 4  # without a gain each size is scored twice
     else:
-        assert (factor, why) == (1.0, "masks leave nothing of the photos to judge by") and not judged
+        assert (factor, why) == (1.0, "masks leave no pixel of the validation photos") and not judged
 
 
 def mask_all_pixels(view: View) -> View:
@@ -445,7 +445,7 @@ def test_photos_without_validation_photos_get_the_whole_run():
     runs = ScenePilots(masked, TrainConfig(steps=7_000), PictureCache(), CPU_DEVICE)
     assert measure_length(runs, exposure=False, budget_factor=None) == (
         7_000,
-        "masks leave nothing of the photos to judge by",
+        "masks leave no pixel of the validation photos",
     )
     assert not runs.scores
 

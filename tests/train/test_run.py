@@ -155,6 +155,23 @@ def test_overwriting_replaces_the_run(tmp_path):
     assert json.loads((tmp_path / "metrics.json").read_text())["settings"]["seed"] == 9
 
 
+def test_an_overwriting_run_that_ends_before_its_first_checkpoint_does_not_leave_that_of_the_earlier_run(
+    tmp_path, monkeypatch
+):
+    context = RunContext(progress=QUIET_CONTEXT.progress, stop=lambda: True)
+    train_model(make_scene(), tmp_path, RUN_CONFIG, context=context)
+    assert (tmp_path / "checkpoint.pt").is_file()
+
+    def fail(*arguments: object, **options: object) -> Trainer:
+        raise HyrfError("the photos are gone", fix="look for them")
+
+    monkeypatch.setattr("hyrfpack.train.run.Trainer", fail)
+    with pytest.raises(HyrfError, match="the photos are gone"):
+        train_model(make_scene(), tmp_path, RUN_CONFIG, overwrite=True, context=QUIET_CONTEXT)
+    with pytest.raises(HyrfError, match="there is no checkpoint to resume"):
+        train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, context=QUIET_CONTEXT)
+
+
 def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(HyrfError, match="file is a file, not a folder"):
