@@ -102,6 +102,15 @@ def strip_path(error: HyrfError, path: object) -> str:
     return error.problem.removeprefix(f"{printable(str(path))}: ")
 
 
+@contextmanager
+def named_in_errors(path: object, name: str) -> Iterator[None]:
+    """Call a file by `name` in the errors of a block, because its path is that of a temporary copy."""
+    try:
+        yield
+    except HyrfError as error:
+        raise error.with_text(error.problem.replace(printable(str(path)), name)) from error
+
+
 def short_reason(error: Exception, max_length: int = 120) -> str:
     """Return the first line of another library's error message, or the error's type, to be quoted in one of ours."""
     return str(error).splitlines()[0][:max_length] if str(error) else type(error).__name__

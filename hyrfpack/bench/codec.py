@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hyrfpack.bench.rows import Row, format_value
 from hyrfpack.bench.subject import Subject
-from hyrfpack.compress.quantize import decide
+from hyrfpack.compress.quantize import plan_and_quantize
 from hyrfpack.compress.sensitivity import measure_sensitivity
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.errors import HyrfError
@@ -173,7 +173,8 @@ def _compact_encoder(subject: Subject, notes: list[str]) -> tuple[Callable[..., 
     )
 
     def encode(distortion: float = subject.distortion, prune: bool = True) -> bytes:
-        return encode_model(subject.model, "compact", quantized=decide(subject.model, sensitivity, distortion, prune))
+        quantized = plan_and_quantize(subject.model, sensitivity, distortion, prune)
+        return encode_model(subject.model, "compact", quantized=quantized)
 
     return encode, {"distortion": subject.distortion, "prune": True}
 

@@ -66,7 +66,7 @@ def calibrate(
     """Scale sensitivities so that they predict the error measured on renders, for plans of about this distortion.
 
     Args:
-        sensitivity: first-order sensitivities from `measure_sensitivity`.
+        sensitivity: first-order sensitivities from `measure_sensitivity`. If no view shows a Gaussian, they stay.
         references: renders of the model.
         distortion, prune: as `make_plan` takes them.
         progress: called with `TaskEvent`s.
@@ -74,6 +74,8 @@ def calibrate(
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
+    if not sensitivity.is_seen:
+        return sensitivity
     decoded = model.decode()
     # Pruning is calibrated first, because the errors of the other parts depend on which Gaussians are left.
     if prune:

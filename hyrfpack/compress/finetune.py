@@ -231,6 +231,7 @@ class _Finetuner:
             return False
         launched, self._launched = self._launched, None
         (loss, *problems), numbers = launched.read_numbers()
+        self.ranks.raise_if_lost()
         if any(problems):
             self.ranks.raise_if_any(problem)
         is_finite, is_complete = np.isfinite(loss), True

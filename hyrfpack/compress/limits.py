@@ -63,14 +63,14 @@ def encode_within_bytes(
     answer = find_fullest(
         encode_candidate, lambda candidate: len(candidate.data), limit, start, trials, DISTORTION_RANGE
     )
-    if answer is None:
-        smallest = len(encode_candidate(DISTORTION_RANGE[1]).data)
+    # Trials may run out before the largest distortion.
+    distortion, candidate = answer or (DISTORTION_RANGE[1], encode_candidate(DISTORTION_RANGE[1]))
+    if (smallest := len(candidate.data)) > limit:
         raise HyrfSizeError(
             f"the model does not fit into {limit:,} bytes, and the smallest possible size is about {smallest:,} bytes",
             fix="use a larger target size, or train with fewer Gaussians (`max_gaussians`)",
             min_bytes=smallest,
         )
-    distortion, candidate = answer
     return candidate, f"distortion {distortion:.2g} gives {len(candidate.data):,} of {limit:,} bytes"
 
 

@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from hyrfpack.atomic import write_atomic
 from hyrfpack.compress.limits import EncodedCandidate
 from hyrfpack.compress.packer import Packer
 from hyrfpack.data.masked_views import mask_view
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, named_in_errors
 from hyrfpack.format.container import Container, read_container
 from hyrfpack.format.info import FileReport
 from hyrfpack.format.part_names import open_parts
@@ -33,13 +34,18 @@ def is_merged(path: Path) -> bool:
         return PART_NAMES in container.entries
 
 
+def name_part(source: Path, name: str) -> str:
+    """Return how messages call a part of a merged file."""
+    return f"{source}: part '{name}'"
+
+
 def iterate_parts(source: Path, progress: Progress) -> Iterator[tuple[str, Path, Progress]]:
     """Yield name, file and progress of each part of a merged file. A file lasts until the next one is asked for."""
     with Container.open(source, SECTION_CONTENTS) as container, tempfile.TemporaryDirectory() as folder:
         models = open_parts(container)
         for number, (name, part) in enumerate(models):
             loose = Path(folder, "part.hyrf")
-            loose.write_bytes(part.read_bytes())
+            write_atomic(loose, part.read_bytes())
             yield name, loose, part_of_progress(progress, number / len(models), (number + 1) / len(models))
 
 
@@ -63,7 +69,8 @@ def compress_parts(
     parts = []
     for name, loose, share in iterate_parts(source, progress):
         packed = loose.with_name("packed.hyrf")
-        compress_part(loose, packed, share)
+        with named_in_errors(loose, name_part(source, name)):
+            compress_part(loose, packed, share)
         parts.append((name, packed.read_bytes()))
     return write_parts(parts, target, overwrite=overwrite)
 

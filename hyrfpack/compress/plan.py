@@ -24,9 +24,9 @@ CLASS_WIDTH_LOG2 = 3.0
 CLASSES_ABOVE_MEAN = 2
 # Pruning a Gaussian is assumed to save this many bits. This is low, because pruned Gaussians take few bits.
 PRUNED_GAUSSIAN_BITS = 16
-# A layer has at least MIN_LAYER_GAUSSIANS and at least 1 / MAX_LAYERS of all Gaussians; smaller layers cost over 1 %.
+# A layer has at least MIN_LAYER_GAUSSIANS and this share of all Gaussians; smaller layers cost over 1 %.
 MIN_LAYER_GAUSSIANS = 5000
-MAX_LAYERS = 8
+MIN_LAYER_SHARE = 1 / 8
 
 
 def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, prune: bool = True) -> Plan:
@@ -69,17 +69,18 @@ def distortion_per_number(model: HybridModel, distortion: float) -> float:
 def indices_to_keep(sensitivity: Sensitivity, per_number: float, prune: bool = True) -> np.ndarray:
     """Return the ascending indices (n,) of the Gaussians whose removal would cost more distortion than rate.
 
+    The most important Gaussian is always kept.
+
     Args:
         sensitivity: sensitivities of all N Gaussians.
         per_number: D, the error that each number may add, see `distortion_per_number`.
         prune: if False, all Gaussians are kept.
     """
     removals = sensitivity.removals
-    return (
-        np.flatnonzero(removals >= LAMBDA_PER_DISTORTION * per_number * PRUNED_GAUSSIAN_BITS)
-        if prune
-        else np.arange(len(removals))
-    )
+    if not prune:
+        return np.arange(len(removals))
+    least = min(LAMBDA_PER_DISTORTION * per_number * PRUNED_GAUSSIAN_BITS, removals.max(initial=0.0))
+    return np.flatnonzero(removals >= least)
 
 
 @torch.no_grad()
@@ -129,7 +130,7 @@ def snap_to_lattice(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> 
 
 def _group_classes_into_layers(members: np.ndarray) -> list[list[int]]:
     """Group consecutive classes into layers that are large enough, given the number of Gaussians in each class."""
-    least = max(MIN_LAYER_GAUSSIANS, members.sum() / MAX_LAYERS)
+    least = max(MIN_LAYER_GAUSSIANS, MIN_LAYER_SHARE * members.sum())
     layers: list[list[int]] = [[]]
     for kind in range(len(members)):
         if members[layers[-1]].sum() >= least and members[kind:].sum() >= least:

@@ -38,7 +38,9 @@ SATURATION_LOGIT = 8.0
 OPACITY_REACH_STEPS = 4
 
 
-def decide(model: HybridModel, sensitivity: Sensitivity, distortion: float, prune: bool = True) -> QuantizedModel:
+def plan_and_quantize(
+    model: HybridModel, sensitivity: Sensitivity, distortion: float, prune: bool = True
+) -> QuantizedModel:
     """Plan a model and quantise it, ready to be encoded. The arguments are those of `make_plan`."""
     plan = make_plan(model, sensitivity, distortion, prune)
     return quantize(plan.apply(model), plan, sensitivity)

@@ -19,7 +19,7 @@ from hyrfpack.scene import Camera
 T = TypeVar("T")
 
 # The number of views of one comparison is chosen so that about this many Gaussians are drawn in all of them together.
-TARGET_DRAWN_GAUSSIANS = 1_000_000
+COMPARISON_DRAWN_GAUSSIANS = 1_000_000
 # Half of the views are at cameras and half between them.
 MIN_COMPARISON_VIEWS = 6
 MAX_COMPARISON_VIEWS = 10
@@ -38,12 +38,11 @@ class ReferenceRenders:
     pictures: list[Tensor]
 
     @classmethod
-    def from_model(cls, model: HybridModel, cameras: Sequence[Camera], seed: int = 1) -> ReferenceRenders:
+    def from_model(cls, model: HybridModel, cameras: Sequence[Camera]) -> ReferenceRenders:
         """Render a model, half of the views at some of its cameras and half between them."""
-        count = (
-            int(np.clip(TARGET_DRAWN_GAUSSIANS // max(len(model), 1), MIN_COMPARISON_VIEWS, MAX_COMPARISON_VIEWS)) // 2
-        )
-        at, between = sample_views(cameras, count, seed)
+        views = COMPARISON_DRAWN_GAUSSIANS // max(len(model), 1)
+        count = int(np.clip(views, MIN_COMPARISON_VIEWS, MAX_COMPARISON_VIEWS)) // 2
+        at, between = sample_views(cameras, count, seed=1)  # not the views between cameras of sensitivities
         return cls.from_views([*at, *between], model)
 
     @classmethod

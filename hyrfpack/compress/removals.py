@@ -14,6 +14,7 @@ from hyrfpack.compress.sensitivity import (
     draw_signs,
     expected_opacity_sensitivity,
     measure_sensitivity,
+    prior_cells,
     removal_error,
 )
 from hyrfpack.model import HybridModel
@@ -24,7 +25,7 @@ from hyrfpack.scene import Camera
 
 
 def measure_removals(
-    model: HybridModel | MergedModel, cameras: Sequence[Camera], seed: int = 0, progress: Progress = ignore_progress
+    model: HybridModel | MergedModel, cameras: Sequence[Camera], progress: Progress = ignore_progress
 ) -> np.ndarray:
     """Estimate the mean squared error (N,) that leaving out each Gaussian adds to pictures; see `removal_error`.
 
@@ -32,14 +33,14 @@ def measure_removals(
     errors are those of `measure_sensitivity`.
     """
     if not isinstance(model, MergedModel):
-        return measure_sensitivity(model, cameras, seed, progress).removals
-    windows = choose_windows(cameras, len(model), seed=seed)
+        return measure_sensitivity(model, cameras, progress=progress).removals
+    windows = choose_windows(cameras, len(model))
     views = windows.views
-    at, _ = sample_views(cameras, len(views) // 2, seed)
+    at, _ = sample_views(cameras, len(views) // 2)
     logits = [part.gaussians.opacity_logits for part in model.parts]
     required = [values.requires_grad for values in logits]
     squares = [torch.zeros_like(values) for values in logits]
-    generator, pixels = torch.Generator(logits[0].device).manual_seed(seed), 0
+    generator, pixels = torch.Generator(logits[0].device).manual_seed(0), 0
     try:
         for values in logits:
             values.requires_grad_(True)
@@ -61,6 +62,6 @@ def measure_removals(
         measured = square[:, 0].double().numpy() / pixels
         geometry = part.decode_geometry()
         guess = expected_opacity_sensitivity(part, geometry, at)
-        sensitivity = combine_with_prior(part, measured, guess, windows.pictures)
+        sensitivity = combine_with_prior(prior_cells(part), measured, guess, windows.pictures)
         removals.append(removal_error(geometry.opacities.detach().double().numpy(), sensitivity))
     return np.concatenate(removals)

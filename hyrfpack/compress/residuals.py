@@ -14,6 +14,7 @@ from hyrfpack.compress.rate_distortion import (
     look_up_bits,
 )
 from hyrfpack.compress.sensitivity import Sensitivity
+from hyrfpack.format.compact.groups import iter_blocks
 from hyrfpack.format.compact.residuals import MAX_ABS_SYMBOL, ResidualSymbols, residual_bands
 from hyrfpack.format.sections import HARMONICS
 from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
@@ -48,7 +49,7 @@ def quantize_residuals(
         mean = np.bincount(classes, weights.mean(axis=1), class_count) / members
         codes = choose_step_codes(np.where(mean > 0, mean, 1), distortion)
         steps = (decode_step(codes) / FIXED_POINT_ONE)[classes][:, None]
-        nearest = np.clip(np.rint(values[:, columns] / steps), -MAX_ABS_SYMBOL, MAX_ABS_SYMBOL).astype(np.int64)
+        nearest = np.clip(np.rint(values[:, columns] / steps), -MAX_ABS_SYMBOL, MAX_ABS_SYMBOL).astype(np.int32)
         bands.append((band, weights, values[:, columns], codes, steps, nearest))
     flags = zero_error > price * values.shape[1]
     chosen = [nearest for *_, nearest in bands]
@@ -57,11 +58,16 @@ def quantize_residuals(
         for band, weights, wanted, _, steps, nearest in bands:
             contexts, count = band.contexts(classes, class_count), class_count * band.components
             bits = estimate_code_bits(nearest[flags].ravel(), contexts[flags].ravel(), count, reach)
-            cost = partial(_added_error, weights.ravel(), wanted.ravel(), np.broadcast_to(steps, wanted.shape).ravel())
-            symbols = choose_symbols(nearest.ravel(), cost, contexts.ravel(), bits, distortion, reach)
-            error += cost(symbols).reshape(wanted.shape).sum(axis=1)
-            rate += look_up_bits(symbols, contexts.ravel(), bits).reshape(wanted.shape).sum(axis=1)
-            chosen.append(symbols.reshape(wanted.shape))
+            symbols = np.empty_like(nearest)
+            for rows in iter_blocks(len(values)):
+                shape, places = nearest[rows].shape, contexts[rows].ravel()
+                scale = np.broadcast_to(steps[rows], shape).ravel()
+                cost = partial(_added_error, weights[rows].ravel(), wanted[rows].ravel(), scale)
+                best = choose_symbols(nearest[rows].ravel().astype(np.int64), cost, places, bits, distortion, reach)
+                error[rows] += cost(best).reshape(shape).sum(axis=1)
+                rate[rows] += look_up_bits(best, places, bits).reshape(shape).sum(axis=1)
+                symbols[rows] = best.reshape(shape)
+            chosen.append(symbols)
         share = np.clip(np.bincount(classes, flags, class_count) / members, 1e-3, 1 - 1e-3)
         rate += np.log2((1 - share) / share)[classes]
         flags = error + price * rate < zero_error

@@ -12,7 +12,7 @@ from hyrfpack.checks import check_type
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB, default_distortion
 from hyrfpack.compress.limits import EncodedCandidate, encode_within_bytes, encode_within_psnr_drop
-from hyrfpack.compress.merged import MergedPacker, compress_parts, is_merged, iterate_parts, mask_scene_views
+from hyrfpack.compress.merged import MergedPacker, compress_parts, is_merged, iterate_parts, mask_scene_views, name_part
 from hyrfpack.compress.packer import Packer
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.report import CompressionReport
@@ -20,7 +20,7 @@ from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, named_in_errors
 from hyrfpack.format.codec import load_with_provenance, packed_provenance, repack, write_model
 from hyrfpack.format.info import FileReport, describe_file
 from hyrfpack.format.min_file_size import check_target_bytes
@@ -84,8 +84,21 @@ def compress_model(
     outputs = Outputs(source, scene=data, overwrite=overwrite)
     ranks.run_on_all(lambda: outputs.file(target) if ranks.is_main else None)
     check_request(config, data)
-    if is_merged(source):
-        return _compress_merged(source, target, config, data, overwrite, context)
+    compress = _compress_merged if is_merged(source) else _compress_single
+    report = compress(source, target, config, data, overwrite, context)
+    if config.profile == "compact" and report.bytes_after > (before := source.stat().st_size):
+        _LOG.warning(
+            f"{report.file}: {report.bytes_after:,} bytes, more than the {before:,} of {source}, which was compressed "
+            "already; keep that file, or set a limit with `target_bytes`"
+        )
+    return report
+
+
+def _compress_single(
+    source: Path, target: StrPath, config: CompressConfig, data: Scene | None, overwrite: bool, context: RunContext
+) -> CompressionReport:
+    """Compress a file of one model."""
+    ranks = context.ranks or SINGLE_PROCESS
     if config.profile != "compact":
         settings = config.encoder_settings()
         repacked = ranks.run_on_all(
@@ -98,11 +111,6 @@ def compress_model(
         lambda: write_model(candidate.data, target, overwrite=overwrite) if ranks.is_main else None
     )
     report = cast(FileReport, ranks.broadcast(written))
-    if report.bytes_after > (before := source.stat().st_size):
-        _LOG.warning(
-            f"{report.file}: {report.bytes_after:,} bytes, more than the {before:,} of {source}, which was compressed "
-            "already; keep that file, or set a limit with `target_bytes`"
-        )
     total = sum(candidate.predicted_errors.values())
     return CompressionReport(
         **vars(report),
@@ -135,7 +143,7 @@ def _compress_merged(
     def compress_part(loose: Path, packed: Path, progress: Progress) -> FileReport:
         nonlocal photos
         own, photos = photos, None
-        return compress_model(loose, packed, config, data=own, context=replace(context, progress=progress))
+        return _compress_single(loose, packed, config, own, True, replace(context, progress=progress))
 
     with context.open_progress("compress") as progress:
         written = compress_parts(source, target, compress_part, progress, overwrite=overwrite)
@@ -149,9 +157,10 @@ def _encode_merged(
     names, packers, start = list[str](), list[Packer](), 0.0
     for name, part, share in iterate_parts(source, part_of_progress(progress, 0.0, SEARCH_ENCODING_START_SHARE)):
         photos = None if packers else data
-        packer, _, distortion = _prepare_packer(
-            part, replace(config, target_bytes=None), photos, context, share, progress
-        )
+        with named_in_errors(part, name_part(source, name)):
+            packer, _, distortion = _prepare_packer(
+                part, replace(config, target_bytes=None), photos, context, share, progress
+            )
         start = start or distortion  # that of the scene
         names.append(name)
         packers.append(packer)
@@ -214,6 +223,11 @@ def _prepare_packer(
     steps = config.finetune_steps or 0
     start = config.distortion or default_distortion(provenance, steps)
     sensitivity, references = measure_calibrated_sensitivity(model, cameras, start, config.prune, measuring_progress)
+    if not sensitivity.is_seen:
+        raise HyrfError(
+            f"{source}: none of its {len(cameras)} cameras sees a Gaussian, so there is nothing to measure",
+            fix="name photos that show the model with `data`, or use profile 'paper'",
+        )
     sensitivity = ranks.broadcast(sensitivity)  # on GPUs the other ranks' values differ in their last bits
     cache = context.cache or PictureCache()
     packer = Packer(model, kept, sensitivity, data, steps, config.prune, encoding_progress, cache, ranks)
@@ -222,9 +236,13 @@ def _prepare_packer(
 
 def check_request(config: CompressConfig, data: Scene | None) -> None:
     """Raise HyrfError if settings exclude each other, or photos are missing or cannot be used."""
-    limits = (config.target_bytes, config.max_psnr_drop, config.distortion)
-    limit_count = sum(limit is not None for limit in limits)
-    if config.profile != "compact" and (data is not None or config.finetune_steps or limit_count):
+    limits = {
+        "a target size": config.target_bytes,
+        "a largest loss of PSNR": config.max_psnr_drop,
+        "a distortion": config.distortion,
+    }
+    given = [name for name, limit in limits.items() if limit is not None]
+    if config.profile != "compact" and (data is not None or config.finetune_steps or given):
         raise HyrfError(
             f"profile '{config.profile}' cannot be fitted to photos, a target size or a limit on the loss",
             fix="use profile 'compact'",
@@ -232,10 +250,11 @@ def check_request(config: CompressConfig, data: Scene | None) -> None:
     if config.profile != "paper" and config.paper is not None:
         raise HyrfError(f"profile '{config.profile}' has none of the settings of 'paper'", fix="leave them out")
     if data is None and (config.finetune_steps or config.max_psnr_drop is not None):
-        raise HyrfError("fine-tuning and limits on PSNR need photos", fix="name their folder with `data`")
-    if limit_count > 1:
+        asked = "steps of fine-tuning" if config.finetune_steps else "limits on the loss of PSNR"
+        raise HyrfError(f"{asked} need photos", fix="name their folder with `data`")
+    if len(given) > 1:
         raise HyrfError(
-            "a target size and a largest loss of PSNR each decide how fine the file is",
+            f"{' and '.join(given)} each decide how fine the file is",
             fix="give one of them",
         )
     if data is not None and not data.train:

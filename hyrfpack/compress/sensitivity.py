@@ -48,6 +48,8 @@ MIN_ZEROED_DECODER_ERROR = 1e-6
 MAX_SHAPE_ANISOTROPY = 1e4
 # Key of the Gaussians that are left out, beside the names of the sections.
 PRUNED_KEY = "pruned"
+# Lower bound of the sensitivities of a Gaussian, which is theirs where no view shows it or its neighbours.
+MIN_SENSITIVITY = 1e-30
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,11 @@ class Sensitivity:
     fields: dict[str, np.ndarray]
     shapes: np.ndarray | None = None
     harmonics: np.ndarray | None = None
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether any of the measured views shows a Gaussian."""
+        return bool((self.colors > MIN_SENSITIVITY).any())
 
     def subset(self, index: np.ndarray | slice) -> Sensitivity:
         """Return the sensitivities of the Gaussians at `index` (n,) int64, and of all fields."""
@@ -224,11 +231,11 @@ def _combine(
 ) -> Sensitivity:
     """Average the accumulated squared gradients, combine them with the prior estimate, and apply lower bounds."""
     geometry = model.decode_geometry()
-    expected = _expected_sensitivity(model, geometry, cameras, jacobian)
+    expected, cells = _expected_sensitivity(model, geometry, cameras, jacobian), prior_cells(model)
     explicit = []
     for name, guess in expected.items():
         measured = squares[f"gaussians.{name}"].double().mean(dim=1).cpu().numpy() / pixels
-        explicit.append(combine_with_prior(model, measured, guess, views))
+        explicit.append(combine_with_prior(cells, measured, guess, views))
     fields = {
         group: np.concatenate([squares[name].double().cpu().numpy().ravel() for name in SECTION_PARAMETERS[group]])
         / field_pixels
@@ -250,9 +257,9 @@ def _combine(
     measured = squares["gaussians.shape_residuals"].double().cpu().numpy() / pixels
     guesses = _expected_shape_sensitivity(geometry, expected["scale_logits"])
     pairs = zip(measured.T, guesses.T, strict=True)
-    shapes = np.stack([combine_with_prior(model, values, guess, views) for values, guess in pairs], axis=1)
+    shapes = np.stack([combine_with_prior(cells, values, guess, views) for values, guess in pairs], axis=1)
     measured = squares["gaussians.color_residuals"].mean(dim=1).double().cpu().numpy() / pixels
-    harmonics = combine_with_prior(model, measured, expected["color_logits"], views)
+    harmonics = combine_with_prior(cells, measured, expected["color_logits"], views)
     return Sensitivity(positions, colors, scales, opacities, removals, fields, shapes, harmonics)
 
 
@@ -267,13 +274,19 @@ def _expected_shape_sensitivity(geometry: Geometry, scale_sensitivity: np.ndarra
     return scale_sensitivity[:, None] * np.concatenate((np.ones((len(scales), 2)), turns), axis=1)
 
 
-def combine_with_prior(model: HybridModel, measured: np.ndarray, guess: np.ndarray, views: float) -> np.ndarray:
+def combine_with_prior(cells: np.ndarray, measured: np.ndarray, guess: np.ndarray, views: float) -> np.ndarray:
     """Average sensitivities (N,) measured in a number of views with estimates, which are known up to a factor.
 
     Few views give a noisy measurement, and a Gaussian that none of them shows may be visible in others.
+
+    Args:
+        cells: (N,) the cell of each Gaussian, see `prior_cells`.
+        measured: (N,) sensitivities measured in the views.
+        guess: (N,) estimates.
+        views: the number of views.
     """
-    prior = _fit_prior(model, measured, guess)
-    return np.maximum((views * measured + PRIOR_WEIGHT_VIEWS * prior) / (views + PRIOR_WEIGHT_VIEWS), 1e-30)
+    prior = _fit_prior(cells, measured, guess)
+    return np.maximum((views * measured + PRIOR_WEIGHT_VIEWS * prior) / (views + PRIOR_WEIGHT_VIEWS), MIN_SENSITIVITY)
 
 
 def removal_error(opacities: np.ndarray, logit_sensitivity: np.ndarray) -> np.ndarray:
@@ -289,7 +302,15 @@ def removal_error(opacities: np.ndarray, logit_sensitivity: np.ndarray) -> np.nd
     return logit_sensitivity / np.maximum(opacities * (1 - opacities), 1e-4) ** 2 * opacities**2
 
 
-def _fit_prior(model: HybridModel, measured: np.ndarray, guess: np.ndarray) -> np.ndarray:
+def prior_cells(model: HybridModel) -> np.ndarray:
+    """Return the cell (N,) of the cube in which each Gaussian lies; estimates are scaled by cells."""
+    cube = model.cube_coords(model.gaussians.positions.detach()).cpu().numpy()
+    return np.minimum((cube * PRIOR_CELLS_PER_AXIS).astype(np.int64), PRIOR_CELLS_PER_AXIS - 1) @ np.array(
+        (1, PRIOR_CELLS_PER_AXIS, PRIOR_CELLS_PER_AXIS**2)
+    )
+
+
+def _fit_prior(cells: np.ndarray, measured: np.ndarray, guess: np.ndarray) -> np.ndarray:
     """Scale the estimate (N,) so that it matches the measurements (N,) in each cell of the cube and overall.
 
     If the estimate is almost zero everywhere, as for Gaussians that are far too small to be seen, the mean of the
@@ -297,10 +318,6 @@ def _fit_prior(model: HybridModel, measured: np.ndarray, guess: np.ndarray) -> n
     """
     if not guess.sum() > MIN_PRIOR_SUM:
         guess = np.ones_like(guess)
-    cube = model.cube_coords(model.gaussians.positions.detach()).cpu().numpy()
-    cells = np.minimum((cube * PRIOR_CELLS_PER_AXIS).astype(np.int64), PRIOR_CELLS_PER_AXIS - 1) @ np.array(
-        (1, PRIOR_CELLS_PER_AXIS, PRIOR_CELLS_PER_AXIS**2)
-    )
     sums = [np.bincount(cells, values, PRIOR_CELLS_PER_AXIS**3) for values in (measured, guess)]
     overall = measured.sum() / max(guess.sum(), 1e-300)
     # A cell with few measurements takes the ratio of all cells.
@@ -333,16 +350,20 @@ def _expected_sensitivity(
         "positions": seen * stretched / area.clamp_min(1e-12),
         "color_logits": seen,
         "scale_logits": seen,
+        "opacity_logits": _opacity_sensitivity(seen, geometry),
     }
-    numbers = {name: values.cpu().numpy() for name, values in guesses.items()}
-    return {**numbers, "opacity_logits": expected_opacity_sensitivity(model, geometry, cameras)}
+    return {name: values.cpu().numpy() for name, values in guesses.items()}
 
 
 @torch.no_grad()
 def expected_opacity_sensitivity(model: HybridModel, geometry: Geometry, cameras: Sequence[Camera]) -> np.ndarray:
     """Estimate the sensitivity (N,) of the opacity logits of unoccluded Gaussians, up to a factor."""
     seen, _ = _expected_light(model, geometry, cameras)
-    return (seen * (1 - geometry.opacities.double()).clamp_min(1e-3) ** 2).cpu().numpy()
+    return _opacity_sensitivity(seen, geometry).cpu().numpy()
+
+
+def _opacity_sensitivity(seen: torch.Tensor, geometry: Geometry) -> torch.Tensor:
+    return seen * (1 - geometry.opacities.double()).clamp_min(1e-3) ** 2
 
 
 def _expected_light(

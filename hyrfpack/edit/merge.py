@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_several
 from hyrfpack.config.edit import Move
 from hyrfpack.edit.transform import Placement
@@ -137,7 +138,7 @@ def take_part(path: Path, part: str | None, folder: StrPath) -> Path:
             names = ", ".join(f"'{name}'" for name in parts)
             raise HyrfError(f"{path}: it holds the parts {names}", fix="name one of them with `part`")
         copy = Path(folder, "part.hyrf")
-        copy.write_bytes(parts[part].read_bytes())
+        write_atomic(copy, parts[part].read_bytes())
         return copy
 
 

@@ -19,7 +19,7 @@ from hyrfpack.cameras.capture import Capture
 from hyrfpack.compress import CompressionReport
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import DISTORTION_RANGE, default_distortion
-from hyrfpack.compress.quantize import decide
+from hyrfpack.compress.quantize import plan_and_quantize
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfError
@@ -214,7 +214,7 @@ def _encode_curve(
             files[SAME_DISTORTION_NAME] = at_same_distortion
             continue
         share = f"{Fraction(factor)} of the distortion" if factor < 1 else f"{factor} times the distortion"
-        quantized = decide(model, sensitivity, float(np.clip(factor * distortion, *DISTORTION_RANGE)))
+        quantized = plan_and_quantize(model, sensitivity, float(np.clip(factor * distortion, *DISTORTION_RANGE)))
         name = SAME_DISTORTION_NAME if factor == 1 else f"compact, {share}"
         files[name] = encode_model(model, "compact", packed_provenance(provenance, model), quantized=quantized)
     return files

@@ -29,7 +29,7 @@ def layered_file(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("layers") / "whole.hyrf"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "MIN_LAYER_GAUSSIANS", 1)
-        patch.setattr(plan, "MAX_LAYERS", 100)
+        patch.setattr(plan, "MIN_LAYER_SHARE", 0.01)
         path.write_bytes(encode(model, "compact", STORED_PROVENANCE, prune=False))
     return path
 

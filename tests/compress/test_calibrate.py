@@ -13,7 +13,7 @@ from hyrfpack.compress.calibrate import MAX_CORRECTION_ROUNDS, calibrate
 from hyrfpack.compress.correction import PREDICTION_TOLERANCE_RATIO, CorrectionFactor
 from hyrfpack.compress.part_errors import QUANTIZED_PARTS, predict_errors, update_decoded
 from hyrfpack.compress.plan import make_plan
-from hyrfpack.compress.quantize import decide
+from hyrfpack.compress.quantize import plan_and_quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.sensitivity import PRUNED_KEY, Sensitivity, measure_sensitivity
 from hyrfpack.format import decode_model, encode_model
@@ -40,7 +40,7 @@ def overlapping_model(count: int = 1500) -> HybridModel:
 
 def predict_and_measure_error(model: HybridModel, sensitivity: Sensitivity, distortion: float) -> tuple[float, float]:
     """Return the predicted error of a packed file, and the error measured at held-out viewpoints."""
-    quantized = decide(model, sensitivity, distortion)
+    quantized = plan_and_quantize(model, sensitivity, distortion)
     decoded = decode_model(encode_model(model, "compact", quantized=quantized))
     predicted = predict_errors(model, quantized.plan.apply(model), quantized, sensitivity)
     return sum(predicted.values()), ReferenceRenders.from_model(model, HELD_OUT_CAMERAS).measure_error(decoded)

@@ -11,7 +11,7 @@ from scenes import alternating_gains, exposed_scene
 
 from hyrfpack.compress.finetune import finetune
 from hyrfpack.compress.plan import make_plan
-from hyrfpack.compress.quantize import decide, quantize
+from hyrfpack.compress.quantize import plan_and_quantize, quantize
 from hyrfpack.compress.sensitivity import Sensitivity, measure_sensitivity
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
@@ -60,7 +60,9 @@ def encode_and_decode(
 
 
 def test_finetuning_gains_more_psnr_than_finer_steps_of_the_same_size(trained_model, plan, sensitivity, scene):
-    finer = encode_model(trained_model, "compact", quantized=decide(trained_model, sensitivity, COARSE_DISTORTION / 3))
+    finer = encode_model(
+        trained_model, "compact", quantized=plan_and_quantize(trained_model, sensitivity, COARSE_DISTORTION / 3)
+    )
     without = evaluate_model(decode_model(finer), scene.train).psnr
     start, _ = encode_and_decode(plan.apply(trained_model), plan, sensitivity)
     events = []

@@ -456,12 +456,16 @@ def test_a_scene_without_training_photos_is_refused(options, scene, tmp_path):
         compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", CompressConfig(**options), data=held_out)
 
 
-def test_an_invisible_model_is_compressed(tmp_path, scene):
-    """All Gaussians lie behind the cameras and there is no background, so that every sensitivity is zero."""
+@pytest.mark.parametrize("background", [False, True])
+def test_a_model_that_no_camera_sees_is_refused(tmp_path, scene, background):
     positions = ball_points(30)[0] * 0.1 + np.array([0.0, 0.0, 500.0])
-    save_model(small_model(positions), tmp_path / "behind.hyrf", "raw")
+    save_model(small_model(positions, background=background), tmp_path / "behind.hyrf", "raw")
 
-    report = compress_model(tmp_path / "behind.hyrf", tmp_path / "small.hyrf", data=scene)
+    with pytest.raises(HyrfError, match=r"behind.hyrf: none of its \d+ cameras sees a Gaussian.*`data`"):
+        compress_model(tmp_path / "behind.hyrf", tmp_path / "small.hyrf", data=scene)
+    assert not (tmp_path / "small.hyrf").exists()
 
-    assert report.bytes_after < (tmp_path / "behind.hyrf").stat().st_size
-    assert all(torch.isfinite(parameter).all() for parameter in load_model(tmp_path / "small.hyrf").parameters())
+
+def test_no_distortion_removes_every_gaussian(tmp_path):
+    compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", CompressConfig(distortion=1.0))
+    assert len(load_model(tmp_path / "small.hyrf")) >= 1

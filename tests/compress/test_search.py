@@ -6,6 +6,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from hyrfpack.compress import distortion
+from hyrfpack.compress.limits import EncodedCandidate, encode_within_bytes
 from hyrfpack.compress.search import (
     ACCEPTED_SIZE_RATIO,
     BRACKETING_RATIO,
@@ -13,6 +15,8 @@ from hyrfpack.compress.search import (
     find_coarsest,
     find_fullest,
 )
+from hyrfpack.errors import HyrfSizeError
+from hyrfpack.progress import Progress, ignore_progress
 
 DISTORTION_RANGE = (1e-8, 1e-2)
 distortions = (
@@ -149,3 +153,14 @@ def test_a_jump_in_the_sizes_ends_the_search():
 
     assert 2e-5 <= noise < 2.1e-5 and len(recorded.made) < 16
     assert TARGET_SIZE_RATIO > ACCEPTED_SIZE_RATIO
+
+
+def test_a_search_without_further_trials_takes_the_largest_distortion_if_that_fits() -> None:
+    def encode(value: float, progress: Progress) -> EncodedCandidate:
+        return EncodedCandidate(bytes(10 if value == distortion.DISTORTION_RANGE[1] else 1000), {})
+
+    candidate, _ = encode_within_bytes(encode, 500, 1e-6, ignore_progress, trials=2)
+    assert len(candidate.data) == 10
+    with pytest.raises(HyrfSizeError) as caught:
+        encode_within_bytes(encode, 5, 1e-6, ignore_progress, trials=2)
+    assert caught.value.min_bytes == 10

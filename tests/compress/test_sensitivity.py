@@ -10,7 +10,13 @@ from ops.device import IS_INTERPRETED, needs_triton
 from scenes import ball_points, ring, small_model
 
 from hyrfpack.cameras.view_sampling import interpolate_views
-from hyrfpack.compress.sensitivity import Sensitivity, choose_windows, combine_with_prior, measure_sensitivity
+from hyrfpack.compress.sensitivity import (
+    Sensitivity,
+    choose_windows,
+    combine_with_prior,
+    measure_sensitivity,
+    prior_cells,
+)
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import SECTION_PARAMETERS
@@ -272,7 +278,7 @@ def test_an_estimate_of_zero_gives_the_mean_of_the_measurements(guess):
     model = small_model(np.random.default_rng(0).uniform(-0.8, 0.8, (20, 3)))
     measured = np.arange(20.0)
 
-    combined = combine_with_prior(model, measured, np.full(20, guess), views=8)
+    combined = combine_with_prior(prior_cells(model), measured, np.full(20, guess), views=8)
 
     assert (combined >= measured / 2).all() and (combined <= 19).all()
     assert combined.mean() == pytest.approx(measured.mean(), rel=0.1)

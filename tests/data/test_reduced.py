@@ -31,7 +31,9 @@ def mean_of_blocks(values: np.ndarray, factor: int) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize(("height", "width", "factor"), [(8, 12, 2), (9, 13, 4), (17, 8, 8), (3, 5, 3), (2, 2, 2)])
+@pytest.mark.parametrize(
+    ("height", "width", "factor"), [(8, 12, 2), (9, 13, 4), (17, 8, 8), (3, 5, 3), (2, 2, 2), (40, 60, 17)]
+)
 def test_a_pixel_is_the_rounded_mean_of_its_block(height: int, width: int, factor: int) -> None:
     picture = make_picture(height, width)
 
@@ -44,10 +46,11 @@ def test_a_pixel_is_the_rounded_mean_of_its_block(height: int, width: int, facto
 
 
 def test_extreme_levels_do_not_overflow() -> None:
-    white = Picture(np.full((16, 16, 3), 255, np.uint8), np.full((16, 16), 255, np.uint8))
+    white = Picture(np.full((34, 34, 3), 255, np.uint8), np.full((34, 34), 255, np.uint8))
 
     for picture in (white, Picture(white.rgb)):
-        assert (reduce_picture(picture, 8).rgb == 255).all()
+        for factor in (8, 16, 17, 34):
+            assert (reduce_picture(picture, factor).rgb == 255).all()
     assert (reduce_picture(white, 16).alpha == 255).all()
 
 

@@ -46,7 +46,7 @@ def raw_file(tmp_path) -> Path:
 def layered_data() -> bytes:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "MIN_LAYER_GAUSSIANS", 1)
-        patch.setattr(plan, "MAX_LAYERS", 100)
+        patch.setattr(plan, "MIN_LAYER_SHARE", 0.01)
         data = encode(model_with_map(600), "compact", prune=False)
     assert "POS1" in read_container(data)
     return data

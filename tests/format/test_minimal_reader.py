@@ -126,7 +126,7 @@ def test_layered_files_decode_to_the_same_bits(layered_data):
 def test_partial_layered_files_decode_to_the_same_bits(layered_data, least, monkeypatch):
     if least:
         monkeypatch.setattr(plan, "MIN_LAYER_GAUSSIANS", least)
-        monkeypatch.setattr(plan, "MAX_LAYERS", 100)
+        monkeypatch.setattr(plan, "MIN_LAYER_SHARE", 0.01)
         layered_data = encode(random_model(2000), "compact")
     entries = read_container(layered_data).entries
     base, top = entries["RTAB"].end, entries["OPA1"].end
@@ -266,7 +266,7 @@ def test_both_readers_refuse_the_same_damage(profile, monkeypatch):
     rng = np.random.default_rng(0)
     if profile == "compact in layers":
         monkeypatch.setattr(plan, "MIN_LAYER_GAUSSIANS", 1)
-        monkeypatch.setattr(plan, "MAX_LAYERS", 100)
+        monkeypatch.setattr(plan, "MIN_LAYER_SHARE", 0.01)
     model = random_model(30)
     if profile.endswith("map"):
         model.exposure = random_map(2, 40)

@@ -53,7 +53,7 @@ def encode_in_small_layers(model: HybridModel) -> bytes:
     """Encode a model with profile compact in as many and as small layers as possible."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plan, "MIN_LAYER_GAUSSIANS", 1)
-        patch.setattr(plan, "MAX_LAYERS", 100)
+        patch.setattr(plan, "MIN_LAYER_SHARE", 0.01)
         return encode(model, "compact", prune=False)
 
 

@@ -159,13 +159,13 @@ def test_a_model_that_cannot_be_rendered_is_rejected_with_a_clear_error(tmp_path
 
 def test_gaussians_that_no_camera_sees_survive():
     """Behind and beside all cameras, sensitivity has a lower bound above zero: they are coarse but still there."""
-    from hyrfpack.compress.quantize import decide
+    from hyrfpack.compress.quantize import plan_and_quantize
     from hyrfpack.compress.sensitivity import measure_sensitivity
 
     model = small_model(np.vstack([ball_points(50)[0], [[0.0, 0.0, 40.0], [300.0, 300.0, 300.0]]]), scale_logits=-2.0)
     cameras = ring(4, width=24, height=24)
 
-    quantized = decide(model, measure_sensitivity(model, cameras), 1e-6, prune=False)
+    quantized = plan_and_quantize(model, measure_sensitivity(model, cameras), 1e-6, prune=False)
     plan, decoded = quantized.plan, encode_and_decode(model, quantized)
 
     assert set(plan.kept) >= {50, 51}

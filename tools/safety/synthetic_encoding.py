@@ -12,7 +12,7 @@ from unittest.mock import patch
 import numpy as np
 
 from hyrfpack.compress import plan as planning
-from hyrfpack.compress.quantize import decide
+from hyrfpack.compress.quantize import plan_and_quantize
 from hyrfpack.compress.sensitivity import Sensitivity, removal_error
 from hyrfpack.format import encode_model
 from hyrfpack.format.arrays import decoder_widths, grid_configs, to_arrays
@@ -66,9 +66,9 @@ def quantize_with_drawn_sensitivity(
         prune: whether Gaussians may be pruned.
         layered: whether the Gaussians are split into layers even if they are few.
     """
-    min_layer_gaussians, max_layers = (2, 100) if layered else (planning.MIN_LAYER_GAUSSIANS, planning.MAX_LAYERS)
-    with patch.multiple(planning, MIN_LAYER_GAUSSIANS=min_layer_gaussians, MAX_LAYERS=max_layers):
-        return decide(model, draw_sensitivity(model), distortion, prune)
+    gaussians, share = (2, 0.01) if layered else (planning.MIN_LAYER_GAUSSIANS, planning.MIN_LAYER_SHARE)
+    with patch.multiple(planning, MIN_LAYER_GAUSSIANS=gaussians, MIN_LAYER_SHARE=share):
+        return plan_and_quantize(model, draw_sensitivity(model), distortion, prune)
 
 
 def quantize_uniformly(model: HybridModel, step: float) -> QuantizedModel:
@@ -76,7 +76,7 @@ def quantize_uniformly(model: HybridModel, step: float) -> QuantizedModel:
     arrays = to_arrays(model)
     ones = {group: np.ones(values.size) for group, values in arrays.items()}
     distortion = step**2 / 12 * sum(values.size for values in arrays.values())
-    return decide(model, Sensitivity(*np.ones((5, len(model))), ones), distortion, prune=False)
+    return plan_and_quantize(model, Sensitivity(*np.ones((5, len(model))), ones), distortion, prune=False)
 
 
 def encode(model: HybridModel, profile: str, provenance: dict | None = None, **settings: object) -> bytes:
