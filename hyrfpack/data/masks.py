@@ -96,6 +96,8 @@ def assign_masks(views: Sequence[View], folder: Path) -> list[View]:
     for view in views:
         if (mask := found.by_photo.get(view.name)) is not None:
             load = loaders[view.name]
+            if isinstance(load, PhotoFile) and mask.resolve() == load.path.resolve():
+                raise HyrfDataError(f"{folder}: it holds the photos themselves", fix="name the folder of their masks")
             check_mask_shape(mask, load.stored, load.orientation if isinstance(load, PhotoFile) else 1)
             masked.append(replace(view, load=replace(load, mask=mask)))
     return masked

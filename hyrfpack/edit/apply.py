@@ -22,7 +22,6 @@ from hyrfpack.edit.state import EditState
 from hyrfpack.edit.transform import Placement, replace_config, unit_vector
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.container import Container
-from hyrfpack.format.info import describe_file
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.part_names import open_parts
 from hyrfpack.format.parts import decode_parts
@@ -68,7 +67,6 @@ class Edit:
     Attributes:
         path: the file that is edited; a copy, if it is a part of a merged file.
         source: the file as messages name it.
-        capture: the cameras and the viewpoint that the file keeps.
         before, after: the scene before the first action and after the last one.
         reports: what each action has done.
         parts: the models of the file that have Gaussians after the last action, in order.
@@ -76,7 +74,6 @@ class Edit:
 
     path: Path
     source: Path
-    capture: Capture
     before: EditState
     after: EditState
     reports: list[ActionReport]
@@ -115,8 +112,15 @@ def open_scene(path: Path, source: Path, data: Scene | None, progress: Progress)
         EditedPart(name, facts.profile, facts.provenance, part, part)
         for (name, _), facts, part in zip(files, metadata, parts_of(model), strict=True)
     ]
-    capture, scene = Capture(describe_file(path)), parts[0]
+    captures = {
+        part.name: Capture({"config": facts.config, "provenance": facts.provenance})
+        for part, facts in zip(parts, metadata, strict=True)
+    }
+    scene = parts[0]
+    capture = captures[scene.name]
     state = EditState(
+        source,
+        captures,
         model,
         capture.cameras,
         capture.viewpoint.center,
@@ -127,7 +131,7 @@ def open_scene(path: Path, source: Path, data: Scene | None, progress: Progress)
         held_out=[] if data is None else list(data.test),
         has_gains=scene.before.exposure is not None or has_mean_exposure(scene.provenance),
     )
-    return Edit(path, source, capture, state, state, [], parts)
+    return Edit(path, source, state, state, [], parts)
 
 
 def apply_actions(edit: Edit, actions: Sequence[Action]) -> Edit:
@@ -137,11 +141,6 @@ def apply_actions(edit: Edit, actions: Sequence[Action]) -> Edit:
         HyrfError: no Gaussian is left, or an action needs photos or cameras that there are not.
     """
     state, reports = edit.before, []
-    if any(isinstance(action, EstimateUp) for action in actions) and edit.capture.is_synthetic and not state.photos:
-        raise HyrfError(
-            f"{edit.source}: it keeps no cameras, from which up could be estimated",
-            fix="state the direction, or name `data`",
-        )
     for action in actions:
         state, report = _apply_action(action, state)
         reports.append(report)
@@ -153,7 +152,7 @@ def apply_actions(edit: Edit, actions: Sequence[Action]) -> Edit:
         provenance = part.provenance if placement.is_identity else placement.move_provenance(part.provenance)
         parts.append(replace(part, after=after, provenance=provenance))
     if any(isinstance(action, Up | EstimateUp) for action in actions):
-        viewpoint = edit.capture.viewpoint
+        viewpoint = state.capture.viewpoint
         camera = state.placement.move_camera(viewpoint.camera)
         turned = replace(viewpoint, center=state.center, up=state.up, camera=camera)
         parts[0] = replace(parts[0], provenance={**parts[0].provenance, "viewpoint": turned.to_json()})
@@ -165,7 +164,7 @@ def _apply_action(action: Action, state: EditState) -> tuple[EditState, ActionRe
     count = len(state.model)
     report = ActionReport(str(action), count, count)
     if isinstance(action, EstimateUp):
-        up, basis = estimate_up([view.camera for view in state.photos] or state.cameras)
+        up, basis = estimate_up(state.photo_cameras("from which up could be estimated"))
         x, y, z = (up.round(4) + 0.0).tolist()  # adding 0.0 turns -0.0 into 0.0
         return replace(state, up=up), replace(report, action=f"{Up((x, y, z))}, estimated from {basis}")
     if isinstance(action, Up):
@@ -198,10 +197,18 @@ def _keep(keep: np.ndarray, state: EditState) -> EditState:
     for name in kept.names:
         if name not in whole.names:
             _LOG.info(f"part '{name}' has no Gaussian left, and is left out")
-    is_changed = whole.names[0] != kept.names[0]
-    if is_changed:
-        _LOG.info(f"the background, the viewpoint and the cameras of the file are those of part '{whole.names[0]}' now")
-    return replace(state, model=whole, has_scene=state.has_scene and not is_changed)
+    if whole.names[0] == kept.names[0]:
+        return replace(state, model=whole)
+    _LOG.info(f"the background, the viewpoint and the cameras of the file are those of part '{whole.names[0]}' now")
+    capture, placement = state.captures[whole.names[0]], state.placement
+    return replace(
+        state,
+        model=whole,
+        cameras=[placement.move_camera(camera) for camera in capture.cameras],
+        center=placement.move_point(capture.viewpoint.center),
+        up=placement.move_direction(capture.viewpoint.up),
+        has_scene=False,
+    )
 
 
 def _refit(action: Refit, state: EditState, report: ActionReport) -> tuple[EditState, ActionReport]:

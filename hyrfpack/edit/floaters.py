@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hyrfpack.data import PictureCache
 from hyrfpack.data.reduced import reduce_view
 from hyrfpack.device import upload
 from hyrfpack.edit.light import measure_light
@@ -30,9 +31,11 @@ from hyrfpack.scene import Camera, View, evenly_spaced
 from hyrfpack.train.resolution import reduced_low_pass_variance
 
 MAX_PHOTOS = 128
-MAX_SIDE_PIXELS = 640  # of the reduced photos
-MIN_PASSES, MIN_STEPS = 16, 600  # passes over the photos; steps of one photo each
-LEARNING_RATES = (0.1, 0.005)  # of the shares of opacity, at the first and after the last step
+MAX_REDUCED_SIDE_PIXELS = 640
+# Each photo is used at least this often, and there are at least so many steps of one photo each.
+MIN_PASSES, MIN_STEPS = 16, 600
+# Learning rates of the shares of opacity, at the first step and after the last one.
+LEARNING_RATES = (0.1, 0.005)
 ADAM_BETAS = (0.9, 0.99)
 # Fading must lower the squared error, the mean of three channels, by this much for each pixel of light that is lost.
 MIN_ERROR_PER_LIGHT = (4.5 / 255) ** 2
@@ -43,7 +46,7 @@ MIN_VIEW_SHARE_IN_FRONT = 0.15
 MIN_SHARE = 0.002
 MIN_OPACITY, MAX_OPACITY = 1e-4, 1 - 1e-4  # limits for finite logits
 MIN_SURFACE_ALPHA = 0.5  # pixels with less coverage show no surface: what is there lies in front of it
-_ADJUSTING_SHARE = 0.9  # of the time
+_FADING_PROGRESS_SHARE = 0.9
 
 
 def find_floaters(
@@ -62,13 +65,13 @@ def find_floaters(
         HyrfError: a photo cannot be read, or a number of the model is NaN or infinite.
     """
     longest = max(max(view.camera.width, view.camera.height) for view in views)
-    factor = math.ceil(longest / MAX_SIDE_PIXELS)
+    factor = math.ceil(longest / MAX_REDUCED_SIDE_PIXELS)
     settings = RenderSettings(low_pass_variance=reduced_low_pass_variance(factor))
     reduced = [reduce_view(view, factor) for view in evenly_spaced(views, MAX_PHOTOS)]
     faded = _supported_shares(model, reduced, settings, progress) < min_opacity_share
     if not faded.any():
         return faded
-    progress(TaskEvent("comparing depths", _ADJUSTING_SHARE))
+    progress(TaskEvent("comparing depths", _FADING_PROGRESS_SHARE))
     others = model.subset(torch.from_numpy(np.flatnonzero(~faded))).requires_grad_(False)
     positions = model.config.frame.to_world(model.gaussians.positions.detach().numpy()[faded])
     cameras = [view.camera for view in reduced]
@@ -96,9 +99,10 @@ def _supported_shares(
     order = np.random.default_rng(0)
     passes = max(MIN_PASSES, math.ceil(MIN_STEPS / len(views)))
     steps = passes * len(views)
-    for step, view in enumerate(views[i] for _ in range(passes) for i in order.permutation(len(views))):
-        progress(TaskEvent("comparing with photos", _ADJUSTING_SHARE * step / steps))
-        photo, mask = upload(view.load(), solid, shares.device)
+    shuffled = (views[i] for _ in range(passes) for i in order.permutation(len(views)))
+    for step, (view, picture) in enumerate(PictureCache().stream(shuffled)):
+        progress(TaskEvent("comparing with photos", _FADING_PROGRESS_SHARE * step / steps))
+        photo, mask = upload(picture, solid, shares.device)
         reduced.gaussians.opacity_logits = logit(shares * before) - fields
         rgb = render_view(reduced, view.camera, settings).rgb
         if not rgb.requires_grad:  # no Gaussian is in view

@@ -36,8 +36,8 @@ def keep_mask(action: object, state: EditState) -> np.ndarray:
     """Return a mask (N,) of the Gaussians that an action of selection keeps.
 
     Raises:
-        HyrfError: the cameras of the scene do not surround anything, the sides of a polygon meet, or there are no
-            photos or masks that the action needs.
+        HyrfError: the cameras of the scene are not known or surround nothing, the sides of a polygon meet, or there are
+            no photos or masks that the action needs.
     """
     raise TypeError(f"{action!r} selects no Gaussians")
 
@@ -62,7 +62,7 @@ def _(action: CropSphere, state: EditState) -> np.ndarray:
 def _(action: CropCameras, state: EditState) -> np.ndarray:
     east, north = _horizontal_axes(state.up)
     plan = np.stack((east, north), axis=1)
-    corners = np.array([camera.position for camera in state.cameras]) @ plan
+    corners = np.array([camera.position for camera in state.photo_cameras("to which it could be cropped")]) @ plan
     try:
         hull = ConvexHull(corners)
     except (QhullError, ValueError):

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from hyrfpack.cameras.capture import Capture
 from hyrfpack.edit.transform import Placement
+from hyrfpack.errors import HyrfError
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel, map_parts, world_positions
 from hyrfpack.progress import Progress, ignore_progress
@@ -19,8 +22,10 @@ class EditState:
     """A scene in the middle of an edit.
 
     Attributes:
+        source: the file as messages name it.
+        captures: cameras and viewpoint of each part of the file before the edit, by name; "" for a file of one model.
         model: the model, or all parts of a merged file that have Gaussians.
-        cameras: the training cameras, in the model's world coordinates.
+        cameras: the training cameras of the first part, in the model's world coordinates.
         center: (3,) the point that the cameras look at, likewise.
         up: (3,) the up direction.
         photos: the training photos, likewise; empty if they are not given.
@@ -31,6 +36,8 @@ class EditState:
         has_scene: whether the first part is the one that the photos show. An edit may leave nothing of that one.
     """
 
+    source: Path
+    captures: Mapping[str, Capture]
     model: HybridModel | MergedModel
     cameras: list[Camera]
     center: np.ndarray
@@ -41,6 +48,29 @@ class EditState:
     held_out: Sequence[View] = ()
     has_gains: bool = False
     has_scene: bool = True
+
+    @property
+    def capture(self) -> Capture:
+        """The cameras and the viewpoint of the first part before the edit."""
+        return self.captures[self.model.names[0] if isinstance(self.model, MergedModel) else ""]
+
+    def photo_cameras(self, purpose: str) -> list[Camera]:
+        """Return the cameras of the photos that show the first part, or those that its file keeps.
+
+        Args:
+            purpose: what needs them, as the end of "it keeps no cameras, ".
+
+        Raises:
+            HyrfError: there are neither.
+        """
+        if self.has_scene and self.photos:
+            return [view.camera for view in self.photos]
+        if self.capture.is_synthetic:
+            raise HyrfError(
+                f"{self.source}: it keeps no cameras, {purpose}",
+                fix="name the photos with `data`, or give numbers instead",
+            )
+        return self.cameras
 
     def move(self, step: Placement) -> EditState:
         """Return the scene in new world coordinates."""

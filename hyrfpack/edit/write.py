@@ -9,14 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
+from hyrfpack.atomic import write_atomic
 from hyrfpack.compress import compress_model
+from hyrfpack.compress.merged import name_part
 from hyrfpack.compress.run import check_request
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.config.edit import EditLimits
 from hyrfpack.context import RunContext
 from hyrfpack.data.masked_views import mask_view
 from hyrfpack.edit.apply import Edit, EditedPart
-from hyrfpack.errors import HyrfError, HyrfSizeError
+from hyrfpack.errors import HyrfError, HyrfSizeError, named_in_errors
 from hyrfpack.format.codec import encode_model, packed_provenance, save_model, write_model
 from hyrfpack.format.container import Container, read_container
 from hyrfpack.format.info import FileReport
@@ -83,14 +85,15 @@ def write_edit(
         with context.open_progress() as progress:
             for number, (part, config, done) in enumerate(zip(edit.parts, settings, copies, strict=True)):
                 share = part_of_progress(progress, number / len(copies), (number + 1) / len(copies))
-                encoded.append(done or _encode_part(part, config, replace(context, progress=share)))
+                encoded.append(done or _encode_part(edit, part, config, replace(context, progress=share)))
         return _write(_join(edit, encoded), target, overwrite)
     photos = None if data is None or limits.max_psnr_drop is None else _unchanged_photos(edit, data)
     with tempfile.TemporaryDirectory() as folder:
         edited = Path(folder, "edited.hyrf")
-        edited.write_bytes(_join(edit, [encode_model(part.after, "raw", part.provenance) for part in edit.parts]))
+        write_atomic(edited, _join(edit, [encode_model(part.after, "raw", part.provenance) for part in edit.parts]))
         try:
-            return compress_model(edited, target, settings[0], data=photos, overwrite=overwrite, context=context)
+            with named_in_errors(edited, str(edit.source)):
+                return compress_model(edited, target, settings[0], data=photos, overwrite=overwrite, context=context)
         except HyrfSizeError as error:
             raise HyrfSizeError(
                 f"{edit.source}: after the edit {error.problem}",
@@ -117,12 +120,13 @@ def _copy_numbers(edit: Edit, part: EditedPart, config: CompressConfig) -> bytes
         return with_metadata(source, part.after.config, part.provenance)
 
 
-def _encode_part(part: EditedPart, config: CompressConfig, context: RunContext) -> bytes:
+def _encode_part(edit: Edit, part: EditedPart, config: CompressConfig, context: RunContext) -> bytes:
     """Encode one part of a merged file by itself."""
     with tempfile.TemporaryDirectory() as folder:
         edited, packed = Path(folder, "edited.hyrf"), Path(folder, "packed.hyrf")
         save_model(part.after, edited, "raw", part.provenance)
-        compress_model(edited, packed, config, context=context)
+        with named_in_errors(edited, name_part(edit.source, part.name)):
+            compress_model(edited, packed, config, context=context)
         return packed.read_bytes()
 
 

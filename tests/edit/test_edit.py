@@ -37,6 +37,7 @@ from hyrfpack.config.edit import (
 from hyrfpack.config.export import ExportConfig
 from hyrfpack.edit import edit_model, plan_edit
 from hyrfpack.edit.transform import Placement
+from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
 from hyrfpack.export import export_model
 from hyrfpack.format import describe_file, load_model, save_model
@@ -205,6 +206,12 @@ def test_cameras_surround_the_inside_of_their_hull_at_any_height(margin, half_si
     report = plan_edit(tmp_path / "ring.hyrf", [CropCameras(margin)], context=QUIET_CONTEXT)
     assert report.actions[0].gaussians_after == pytest.approx(inside.sum(), abs=2)
     assert 0 < inside.sum() < len(inside)
+
+
+def test_a_file_without_cameras_is_not_cropped_to_cameras(tmp_path):
+    save_model(load_model(RAW_FILE), tmp_path / "bare.hyrf")
+    with pytest.raises(HyrfError, match="bare.hyrf: it keeps no cameras, to which it could be cropped"):
+        plan_edit(tmp_path / "bare.hyrf", [Remove(CropCameras(0.1))], context=QUIET_CONTEXT)
 
 
 def test_opacities_and_scales_are_compared_with_the_limits():

@@ -120,6 +120,7 @@ def test_masks_that_cannot_be_used_are_a_clear_error(photos, masks, tmp_path):
     for name in ("one.png", "two.png"):
         Image.new("L", (48, 48)).save(missing / name)
     assert "no mask has the name of a photo" in refused(*command, missing, "--data", photos)
+    assert "it holds the photos themselves" in refused(*command, photos / "images", "--data", photos)
     first = next(iter(masks.iterdir())).name
     Image.new("L", (48, 20)).save(missing / first)
     assert "the mask is 48 x 20 but its photo 48 x 48" in refused(*command, missing, "--data", photos)

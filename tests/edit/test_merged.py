@@ -14,11 +14,13 @@ from layers import only_in_acceptance
 from scenes import QUIET_CONTEXT, ball_points, ball_scene, camera_at, ring, small_model
 from scipy.spatial import Delaunay
 
-from hyrfpack.cameras.capture import provenance_cameras
+from hyrfpack.cameras.capture import Capture, provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.compress import compress_model
 from hyrfpack.compress.removals import measure_removals
 from hyrfpack.config.edit import (
     Background,
+    Center,
     CropBox,
     CropCameras,
     CropMasks,
@@ -184,6 +186,30 @@ def test_a_part_that_is_left_with_nothing_is_left_out_with_a_note(merged, tmp_pa
     assert "part 'room' has no Gaussian left, and is left out" in notes
     assert "those of part 'toy' now" in notes
     assert load_model(only_toy.file).config.frame == load_merged_model(merged).parts[1].config.frame
+
+
+def test_actions_after_the_first_part_is_left_out_use_the_cameras_of_the_next(merged, tmp_path):
+    crops = [Scale(2.0), CropSphere((2.7, 0.8, 0), 0.4)]
+    moves = [Translate((2.0, 0.0, 0.0)), Center(), Up((0, 1, 0))]
+
+    at_once = edit_model(merged, tmp_path / "at_once.hyrf", [*crops, *moves], context=QUIET_CONTEXT)
+    cropped = edit_model(merged, tmp_path / "toy.hyrf", crops, context=QUIET_CONTEXT)
+    in_turn = edit_model(cropped.file, tmp_path / "in_turn.hyrf", moves, context=QUIET_CONTEXT)
+
+    assert "parts" not in describe_file(at_once.file)
+    frames = [load_model(report.file).config.frame for report in (at_once, in_turn)]
+    np.testing.assert_allclose(frames[0].center, frames[1].center, atol=1e-9)
+    viewpoints = [Capture(describe_file(report.file)).viewpoint for report in (at_once, in_turn)]
+    for name in ("center", "up"):
+        np.testing.assert_allclose(*(getattr(viewpoint, name) for viewpoint in viewpoints), atol=1e-9)
+
+
+def test_a_message_about_a_part_that_cannot_be_compressed_names_file_and_part(merged, tmp_path):
+    far = ball_points(30)[0] * 0.1 + np.array([0.0, 0.0, 500.0])
+    save_model(small_model(far), tmp_path / "far.hyrf", provenance={"cameras": provenance_cameras(CAMERAS)})
+    merge_models([merged.with_name("toy.hyrf"), tmp_path / "far.hyrf"], tmp_path / "two.hyrf")
+    with pytest.raises(HyrfError, match=r"two.hyrf: part 'far': none of its \d+ cameras sees a Gaussian"):
+        compress_model(tmp_path / "two.hyrf", tmp_path / "out.hyrf", context=QUIET_CONTEXT)
 
 
 def test_an_edit_that_leaves_nothing_is_refused(merged, tmp_path):
