@@ -82,7 +82,7 @@ def _reduce_photos(source: Path, folder: Path) -> bool:
     chosen = evenly_spaced(photos, MAX_PHOTOS)
     targets = [folder / path.parent.relative_to(source) / f"{n:04}.jpg" for n, path in enumerate(chosen)]
     for parent in {target.parent for target in targets}:
-        parent.mkdir(parents=True)
+        parent.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor() as pool:
         list(pool.map(_reduce_photo, chosen, targets))
     return True

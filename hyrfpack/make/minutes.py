@@ -153,7 +153,7 @@ def fit_plan_to_minutes(
         draft_max_size = min(reading.max_size or draft.max_size, draft.max_size)
         return dataclasses.replace(requested, steps=draft.steps, max_size=draft_max_size)
     sizes = _candidate_sizes(scene, reading.max_size)
-    probed = next((size for size in reversed(sizes) if size >= MIN_PROBE_PHOTO_SIZE), sizes[-1])
+    probed = next((size for size in reversed(sizes) if size >= MIN_PROBE_PHOTO_SIZE), sizes[0])
     scenes = {reading.max_size: scene}
 
     def at(size: int) -> Scene:

@@ -38,10 +38,12 @@ def write_preview(stage_cache: StageCache, trainer: Trainer, context: RunContext
     target, trained = stage_cache.folder / PREVIEW_FILE, stage_cache.folder / _TRAINED_FILE
     _LOG.info("stopping: compressing the scene as it is now; a second interruption skips this")
     provenance = {"steps": trainer.step, "choices": trainer.choices, **training_provenance(trainer.scene)}
+    # The stop that ended the training does not end the compression, too.
+    compressing = replace(context, progress=stage_cache.reporter.report_event, stop=None)
     try:
         trainer.fit_exposure_map()
         save_model(trainer.model, trained, profile="raw", provenance=provenance)
-        compress_model(trained, target, context=replace(context, progress=stage_cache.reporter.report_event))
+        compress_model(trained, target, context=compressing)
     except HyrfError as error:
         _LOG.warning(f"the scene so far cannot be written: {error}")
         return None

@@ -33,11 +33,18 @@ class Reporter:
         estimates: forecast seconds of parts by name, as far as known.
     """
 
-    def __init__(self, stages: Sequence[str], progress: Progress) -> None:
-        """Prepare to report the stages, whose names are in the order in which they run."""
+    def __init__(self, stages: Sequence[str], progress: Progress, stop: Callable[[], bool] | None = None) -> None:
+        """Prepare to report the stages.
+
+        Args:
+            stages: their names, in the order in which they run.
+            progress: called with `StageEvent`s.
+            stop: returns whether to stop, see `RunContext`. Training asks it by itself, because it saves a checkpoint.
+        """
         self.estimates: dict[str, float] = {}
         self._stages = tuple(stages)
         self._progress = progress
+        self._stop = stop
         self._call_watcher: Callable[[], None] = lambda: None
         self._part = parts_of(stages[0])[0]
         self._pace = SharePace(monotonic())  # of the current part
@@ -74,7 +81,12 @@ class Reporter:
         Args:
             share: share of the part that is done, 0 to 1; 0 if it is unknown.
             words: descriptions of the current work, the most important first.
+
+        Raises:
+            KeyboardInterrupt: the call is to stop, outside of the training.
         """
+        if self._stop is not None and stage_of(self._part) != "training" and self._stop():
+            raise KeyboardInterrupt
         self._call_watcher()
         self._share = share
         now = monotonic()

@@ -184,7 +184,7 @@ class _Pipeline:
         self.request = request
         self.source = request.source
         self.began = began
-        self.reporter = Reporter(request.stages, progress)
+        self.reporter = Reporter(request.stages, progress, context.stop)
         self.owns_cache = context.cache is None
         self.cache = context.cache or PictureCache()
         self.context = replace(context, device=request.device, progress=self.reporter.report_event, cache=self.cache)

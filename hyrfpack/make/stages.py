@@ -133,7 +133,8 @@ def run_training_stage(
             trainers: list[Trainer] = []
 
             def observe(trainer: Trainer) -> None:
-                trainers[:] = [trainer]
+                # A finished trainer is not kept, so that its memory is free while results are written.
+                trainers[:] = [trainer] if trainer.step < trainer.steps else []
                 if observer is not None:
                     observer(trainer)
 
@@ -164,7 +165,7 @@ def trained_target_bytes(stage_cache: StageCache) -> int | None:
 
 
 def _is_run_finished(run: Path) -> bool:
-    """Return whether a run is finished even if its record does not say so; its checkpoint is removed last."""
+    """Return whether a run is finished even if its record does not say so; `metrics.json` is written last."""
     return (run / METRICS_FILE).is_file() and (run / MODEL_FILE).is_file() and not (run / CHECKPOINT_FILE).exists()
 
 

@@ -85,6 +85,16 @@ def test_a_failed_first_look_is_logged_and_the_estimation_goes_on(make, photos, 
     assert result.output.is_file() and not (result.work / "first_look").exists()
 
 
+def test_photos_may_lie_in_a_folder_and_its_subfolders(photos, tmp_path):
+    paths = sorted(photos.iterdir())
+    for depth, path in enumerate(paths[:6]):
+        target = photos.joinpath(*"abcdef"[:depth], path.name)
+        target.parent.mkdir(exist_ok=True)
+        path.rename(target)
+    assert first_look._reduce_photos(photos, tmp_path / "reduced")
+    assert len(list((tmp_path / "reduced").rglob("*.jpg"))) == min(len(paths), first_look.MAX_PHOTOS)
+
+
 @pytest.mark.usefixtures("fake_stages")
 def test_an_interrupted_first_look_leaves_nothing_and_the_same_call_resumes(make, photos, poses):
     def interrupt(trainer) -> None:

@@ -112,3 +112,12 @@ def test_the_progress_of_a_stage_covers_all_its_parts_and_never_decreases(clock)
     reporter.update(1.0)
     reporter.begin_part("results", "scores")
     assert [progress.share for progress in messages] == pytest.approx([0.0, 0.1, 0.2, 0.5, 0.8, 0.8])
+
+
+def test_a_stop_ends_all_stages_but_training():
+    reporter = Reporter(["poses", "training", "export"], lambda event: None, stop=lambda: True)
+    reporter.begin("training")
+    reporter.update(0.5)
+    for stage in ("poses", "export"):
+        with pytest.raises(KeyboardInterrupt):
+            reporter.begin(stage)

@@ -22,7 +22,7 @@ from hyrfpack.config.make import MakeConfig
 from hyrfpack.context import RunContext
 from hyrfpack.format import describe_file
 from hyrfpack.format.codec import load_with_provenance
-from hyrfpack.make import make_scene, stages
+from hyrfpack.make import Stopped, make_scene, stages
 from hyrfpack.make.progress import Reporter
 from hyrfpack.progress import StageEvent, ignore_progress
 from hyrfpack.progress.lines import LineDisplay
@@ -54,6 +54,15 @@ def test_every_stage_reports_its_progress_and_the_remaining_time(finished_work, 
         assert 0 <= progress.share <= 1 and progress.seconds_left is not None and progress.seconds_left >= 0, progress
     for stage in ("training", "compression", "scoring"):
         assert max(progress.share for progress in reports if progress.stage == stage) > 0.5
+
+
+@pytest.mark.acceptance
+def test_a_stop_asked_by_the_context_leaves_a_preview(posed, tmp_path):
+    details: list[str] = []
+    context = RunContext(progress=lambda event: details.extend(event.details[:1]), stop=lambda: "step 5/9" in details)
+    with pytest.raises(Stopped, match="stopped in training") as stopped:
+        make_scene(posed, tmp_path / "scene.html", context=context)
+    assert stopped.value.preview == tmp_path / "scene.work" / "preview.hyrf" and stopped.value.preview.is_file()
 
 
 def test_an_interrupted_command_resumes_from_its_checkpoint_to_the_same_products(
