@@ -23,7 +23,7 @@ def check_int(name: str, value: Any, minimum: int, maximum: int | None = None) -
     if is_int and value >= minimum and (maximum is None or value <= maximum):
         return
     allowed = f"of at least {minimum}" if maximum is None else f"in [{minimum}, {maximum}]"
-    raise ValueError(f"{name} is {value!r}; it must be an int {allowed}")
+    raise ValueError(f"{name} is {value!r}; it must be a whole number {allowed}")
 
 
 def check_float(name: str, value: Any, minimum: float = 0.0, maximum: float = MAX_FLOAT) -> None:
@@ -34,8 +34,8 @@ def check_float(name: str, value: Any, minimum: float = 0.0, maximum: float = MA
     """
     if isinstance(value, float | int) and not isinstance(value, bool) and minimum <= value <= maximum:
         return
-    allowed = f"finite and at least {minimum:g}" if maximum == MAX_FLOAT else f"in [{minimum:g}, {maximum:g}]"
-    raise ValueError(f"{name} is {value!r}; it must be a float, {allowed}")
+    allowed = f"of at least {minimum:g}, and finite" if maximum == MAX_FLOAT else f"in [{minimum:g}, {maximum:g}]"
+    raise ValueError(f"{name} is {value!r}; it must be a number {allowed}")
 
 
 def check_bool(name: str, value: Any) -> None:

@@ -13,9 +13,11 @@ from hyrfpack.cli.section_table import format_section_table
 from hyrfpack.cli.types import INPUT_PATH
 from hyrfpack.cli.wording import use_option_names
 from hyrfpack.counts import format_count
-from hyrfpack.errors import printable
+from hyrfpack.errors import HyrfError, printable
 from hyrfpack.format.info import SectionSize
 from hyrfpack.outputs import ARCHIVE_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES
+
+EXPORT_ONLY_SUFFIXES = (".glb", ".html", ".obj", ".stl", ".usda", ".usdc", ".usdz")
 
 
 @click.command(short_help="Describe a file, a run or a folder of photos.")
@@ -59,6 +61,13 @@ def info(path: Path, as_json: bool) -> None:
         path.is_file() and path.suffix.lower() in (*ARCHIVE_SUFFIXES, *VIDEO_SUFFIXES, *PICTURE_SUFFIXES)
     ):
         _print_photos(path, as_json)
+    elif path.suffix.lower() == ".json":
+        raise HyrfError(f"{path}: poses are described with their photos", fix="name the folder that holds the photos")
+    elif path.suffix.lower() in EXPORT_ONLY_SUFFIXES:
+        raise HyrfError(
+            f"{path}: files with this extension are written for other programs and not read",
+            fix="name the model, splats (.ply, .splat, .spz, .sog), or a folder of photos",
+        )
     else:
         _print_model(path, as_json)
 

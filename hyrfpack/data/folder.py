@@ -21,6 +21,7 @@ _NON_PHOTO_FOLDER = re.compile(r"masks?(_.*)?|thumb(nail)?s?|depths?(_maps?)?|no
 _HIDDEN_FOLDER = re.compile(r"\..*|__.*|@eadir", re.IGNORECASE)  # such as __MACOSX, and @eaDir of Synology
 _DOWNSCALED_FOLDER = re.compile(r"images_(\d{1,4})", re.IGNORECASE)  # smaller copies of the photos in images/
 _RESULT_FILE = re.compile(r"poses\.json|metrics\.json|.*\.hyrf")  # hyrfpack wrote a folder that holds one of these
+_EXPORTED_FILES = ("lod-meta.json", "tileset.json", "hyrf-viewer.js")  # Streamed SOG, 3D Tiles, a player
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36, 24)  # equivalent focal lengths refer to it (CIPA DCG-001)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # keys are values of EXIF's FocalPlaneResolutionUnit
 # Numbers of EXIF tags.
@@ -73,12 +74,18 @@ def list_photos(folder: StrPath) -> list[Path]:
         opened.
 
     Raises:
-        HyrfDataError: the folder does not exist or cannot be read.
+        HyrfDataError: the folder does not exist, cannot be read, or was exported by hyrfpack.
 
     Example:
         >>> [path.name for path in list_photos("photos/bonsai")][:2]
         ['0000.png', '0001.png']
     """
+    for name in _EXPORTED_FILES:
+        if Path(folder, name).is_file():
+            raise HyrfDataError(
+                f"{folder}: this folder was exported ({name}), and its pictures are not photos",
+                fix="name the folder of the photos, or the model that was exported",
+            )
     return _list_files(Path(folder), is_picture_name, photos_only=True)
 
 

@@ -95,6 +95,8 @@ def _decide_degree(
         else "viewpoints around the scene, because the file stores no cameras (name photos with `data`)"
     )
     highest = kind.max_degree if config.degree is None else min(config.degree, kind.max_degree)
+    if config.degree is not None and config.degree > highest:
+        _LOG.info(f"{kind.ending} stores harmonics up to degree {highest}; higher ones are left out")
     degree, chosen_by = highest, dict[int, float]()
     is_chosen = config.degree is None and highest > 0
     if is_chosen:

@@ -162,6 +162,11 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
                 f"{source}: this is a model, not splats",
                 fix=f"write it with 'hyrfpack export {source} -o {target}'",
             )
+        if (Path(source) / "lod-meta.json").is_file():
+            raise HyrfError(
+                f"{source}: this is a Streamed SOG, which has a SOG for each of its parts and levels",
+                fix="name one of the folders in it, such as 0_0",
+            )
         raise HyrfError(
             f"{source}: this is not a file of splats",
             fix=f"give a file that ends in {', '.join(READABLE_ENDINGS)}, or the folder of a SOG",

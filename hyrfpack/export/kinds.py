@@ -121,10 +121,10 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
     Raises:
         HyrfError: the settings contradict the kind, or a package is missing.
     """
-    if kind is TRANSFORMS_JSON and (config.crop is not None or config.min_opacity > 0):
+    if kind is TRANSFORMS_JSON and (config.crop is not None or config.min_opacity > 0 or not config.background):
         raise HyrfError(
-            f"{target}: this file holds only cameras, so that Gaussians cannot be selected",
-            fix="leave out `crop` and `min_opacity`",
+            f"{target}: this file holds only cameras, so that nothing can be left out",
+            fix="leave out `crop`, `min_opacity` and `background=False`",
         )
     if kind in LEVEL_FOLDERS and (config.crop is not None or config.min_opacity > 0):
         raise HyrfError(
@@ -152,6 +152,11 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
         raise HyrfError(
             f"{target}: the folder of a player holds the model file itself and no baked splats",
             fix="with `baked=True`, use a path that ends in .html",
+        )
+    if config.baked and kind is not HTML_PAGE:
+        raise HyrfError(
+            f"{target}: only a page can hold the model itself or baked splats; this format always holds the latter",
+            fix="leave out `baked`",
         )
     texts = {"`title`": config.title, "`credit`": config.credit}
     given = " and ".join(name for name, text in texts.items() if text)

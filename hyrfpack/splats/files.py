@@ -17,6 +17,7 @@ from hyrfpack.splats.table import FORMATS
 
 # ".ply" covers ".compressed.ply".
 READABLE_ENDINGS = tuple(ending for ending, row in FORMATS.items() if row.is_readable)
+MAX_HEADER_BYTES_SEARCHED = 65536
 MAX_LISTED_NAMES = 4
 MAX_FILE_BYTES = 1 << 32  # a PLY of this size holds 17 million Gaussians
 
@@ -52,6 +53,11 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
     try:
         if path.is_dir():
             return sog.decode_files(_read_unbundled_sog(path), str(path))
+        if extension == ".hyrf" and path.exists():
+            raise HyrfDataError(
+                f"{path}: this is a model already, not splats of another program",
+                fix="use it as it is, or write splats with 'hyrfpack export'",
+            )
         if path.exists() and extension not in READABLE_ENDINGS:
             raise HyrfDataError(
                 f"{path}: files with this extension are not supported",
@@ -71,16 +77,25 @@ def _read_unbundled_sog(folder: Path) -> dict[str, bytes]:
     names = os.listdir(folder)
     if sog.META_NAME not in names:
         splats = sorted(name for name in names if name.lower().endswith(READABLE_ENDINGS))
-        advice = f"name {splats[0]} in it" if splats else "name another folder"
+        splats = [name for name in splats if not name.lower().endswith(".ply") or _holds_gaussians(folder / name)]
+        levels = sorted(name for name in names if (folder / name / sog.META_NAME).is_file())
+        nothing = "name another folder, or use 'hyrfpack make' if it holds photos"
         raise HyrfDataError(
             f"{folder}: a folder is read as a loose SOG, {sog.META_NAME} with its pictures, and this one holds "
             f"{_format_names(names)}",
-            fix=advice,
+            fix=f"name {(splats or levels)[0]} in it" if splats or levels else nothing,
         )
     files = {sog.META_NAME: _read_bytes(folder / sog.META_NAME)}
     for name in sog.picture_names(files[sog.META_NAME], str(folder)):
         files[name] = _read_bytes(folder / name)
     return files
+
+
+def _holds_gaussians(file: Path) -> bool:
+    """Return whether the header of a PLY file names properties of Gaussians."""
+    with file.open("rb") as stream:
+        header = stream.read(MAX_HEADER_BYTES_SEARCHED)
+    return b" f_dc_0" in header or b" packed_position" in header
 
 
 def _format_names(names: list[str]) -> str:

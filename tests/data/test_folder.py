@@ -51,6 +51,14 @@ def test_folders_of_results_are_omitted_except_the_given_one(mark, tmp_path):
     assert list_names(tmp_path / "run") == ["views/1.png"]
 
 
+@pytest.mark.parametrize("name", ["lod-meta.json", "tileset.json", "hyrf-viewer.js"])
+def test_an_exported_folder_is_not_one_of_photos(name, tmp_path):
+    (tmp_path / name).touch()
+    (tmp_path / "poster.jpg").touch()
+    with pytest.raises(HyrfDataError, match=rf"this folder was exported \({name}\), and its pictures are not photos"):
+        list_photos(tmp_path)
+
+
 def test_circular_links_are_followed_once(tmp_path):
     save_photo(tmp_path / "a" / "1.png")
     (tmp_path / "a" / "again").symlink_to(tmp_path)

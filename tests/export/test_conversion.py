@@ -136,6 +136,12 @@ def test_unsupported_conversions_are_refused_with_what_to_do(source, target, sen
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
+def test_a_streamed_sog_is_refused_with_the_folders_to_name(tmp_path):
+    (tmp_path / "lod-meta.json").touch()
+    with pytest.raises(HyrfError, match="name one of the folders in it, such as 0_0"):
+        hyrfpack.convert_splats(tmp_path, tmp_path / "a.ply")
+
+
 def test_a_version_of_spz_is_refused_for_another_format(tmp_path):
     source = write_splats(tmp_path, ".spz", ball_splats(5))
     with pytest.raises(HyrfError, match=r"after.ply: only .spz files have a version; leave out `spz_version`"):

@@ -163,3 +163,22 @@ def test_title_and_credit_are_only_for_pages(model_file, tmp_path):
     assert "<title>&lt;Room&gt;</title>" in page and '<p id="credit">A. B.</p>' in page
     with pytest.raises(HyrfError, match=r"a\.ply: only pages show a title and a credit; leave out `credit`"):
         export_model(model_file, tmp_path / "a.ply", ExportConfig(credit="A. B."))
+
+
+@pytest.mark.parametrize(
+    ("target", "config", "sentence"),
+    [
+        ("a.ply", ExportConfig(baked=True), "always holds the latter; leave out `baked`"),
+        ("a.json", ExportConfig(background=False), "only cameras, so that nothing can be left out"),
+    ],
+)
+def test_settings_without_an_effect_are_refused(model_file, tmp_path, target, config, sentence):
+    with pytest.raises(HyrfError, match=sentence):
+        export_model(model_file, tmp_path / target, config)
+    assert not (tmp_path / target).exists()
+
+
+def test_a_degree_that_a_format_cannot_store_is_logged(model_file, tmp_path, caplog):
+    with caplog.at_level("INFO", "hyrfpack"):
+        assert export_model(model_file, tmp_path / "a.splat", ExportConfig(degree=2)).degree == 0
+    assert ".splat stores harmonics up to degree 0; higher ones are left out" in caplog.messages

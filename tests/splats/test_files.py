@@ -107,6 +107,26 @@ def test_the_error_for_a_folder_without_a_sog_lists_its_files(holds, message_par
         assert message_part in str(refusal.value)
 
 
+def test_the_error_for_a_folder_names_no_point_cloud(tmp_path):
+    header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\n{}end_header\n"
+    (tmp_path / "a.ply").write_text(header.format(""))
+    with pytest.raises(HyrfDataError, match="holds a.ply; name another folder, or use 'hyrfpack make'"):
+        read_splats(tmp_path)
+    (tmp_path / "b.ply").write_text(header.format("property float f_dc_0\n"))
+    with pytest.raises(HyrfDataError, match="name b.ply in it"):
+        read_splats(tmp_path)
+    (tmp_path / "level" / "0_0").mkdir(parents=True)
+    (tmp_path / "level" / "0_0" / "meta.json").touch()
+    with pytest.raises(HyrfDataError, match="name 0_0 in it"):
+        read_splats(tmp_path / "level")
+
+
+def test_a_model_is_not_read_as_splats(tmp_path):
+    (tmp_path / "a.hyrf").touch()
+    with pytest.raises(HyrfDataError, match="this is a model already, not splats of another program"):
+        read_splats(tmp_path / "a.hyrf")
+
+
 @pytest.mark.parametrize("name", ["none.ply", "none.txt", "none", "none/meta.json"])
 def test_a_missing_file_is_reported_for_any_suffix(name, tmp_path):
     with pytest.raises(HyrfDataError, match="none.*: the file cannot be read"):

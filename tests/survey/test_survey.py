@@ -220,6 +220,9 @@ def test_info_of_a_file_that_is_no_photo_is_a_clear_error(tmp_path):
     assert "set.zip" in refused("info", tmp_path / "set.zip")
     (tmp_path / "empty").mkdir()
     assert "no photos here" in refused("info", tmp_path / "empty")
+    for name, sentence in (("a.glb", "written for other programs and not read"), ("a.json", "with their photos")):
+        (tmp_path / name).touch()
+        assert sentence in refused("info", tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["data.quality", "survey.describe", "poses.frames", "poses.video"])
