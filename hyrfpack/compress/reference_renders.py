@@ -42,7 +42,8 @@ class ReferenceRenders:
         """Render a model, half of the views at some of its cameras and half between them."""
         views = COMPARISON_DRAWN_GAUSSIANS // max(len(model), 1)
         count = int(np.clip(views, MIN_COMPARISON_VIEWS, MAX_COMPARISON_VIEWS)) // 2
-        at, between = sample_views(cameras, count, seed=1)  # not the views between cameras of sensitivities
+        # Another seed than that of sensitivities gives other views between the cameras.
+        at, between = sample_views(cameras, count, seed=1)
         return cls.from_views([*at, *between], model)
 
     @classmethod
