@@ -6,15 +6,15 @@ import logging
 import os
 import re
 import shutil
-from collections.abc import Sequence
-from contextlib import ExitStack, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count as count_up
 from pathlib import Path
 
 from PIL import Image
 
-from hyrfpack.atomic import pending_file, write_atomic
+from hyrfpack.atomic import pending_file
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.checks import check_several, check_type
 from hyrfpack.counts import format_count
@@ -103,8 +103,10 @@ def export_player(
         check_folder(folder, sources, [data], overwrite=overwrite, is_gallery=False)
         if source is not None:
             suggest_compression(source)
-        with nullcontext(None) if source is None else single_file(source) as file:
-            return _write_player(file, _OutputFolder(Path(folder), overwrite), data, title, credit, editable)
+        with ExitStack() as joined:
+            file = None if source is None else joined.enter_context(single_file(source))
+            output = joined.enter_context(_OutputFolder(Path(folder), overwrite))
+            return _write_player(file, output, data, title, credit, editable)
 
 
 def _write_player(
@@ -203,7 +205,8 @@ def export_gallery(
             for source in sources:
                 suggest_compression(source)
             files = [joined.enter_context(single_file(source)) for source in sources]
-            return _write_gallery(files, _OutputFolder(Path(folder), overwrite), scenes, title, credit, editable)
+            output = joined.enter_context(_OutputFolder(Path(folder), overwrite))
+            return _write_gallery(files, output, scenes, title, credit, editable)
 
 
 def _write_gallery(
@@ -327,21 +330,41 @@ def _describe_quality(path: StrPath, model: HybridModel | MergedModel, data: Sce
 class _OutputFolder:
     """An output folder that counts the bytes written; each file is written completely or not at all.
 
-    The files refer to each other by name, so a name that is taken causes an error instead of another name.
+    The files refer to each other by name, so a name that is taken causes an error instead of another name. If the block
+    fails, the files that were not there before are removed, so that the same call can be repeated.
     """
 
     def __init__(self, path: Path, overwrite: bool) -> None:
         self.path, self.overwrite, self.bytes = path, overwrite, 0
+        self._added: list[Path] = []
+
+    def __enter__(self) -> _OutputFolder:
+        return self
+
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        if error is not None:
+            for path in self._added:
+                with suppress(OSError):
+                    path.unlink()
 
     def write(self, name: str, data: bytes) -> None:
-        write_atomic(self.path / name, data, overwrite=self.overwrite, rename=False)
-        self.bytes += len(data)
+        with self._pending(name, len(data)) as temporary:
+            temporary.write_bytes(data)
 
     def copy(self, name: str, source: StrPath) -> None:
-        length = os.path.getsize(source)
-        with pending_file(self.path / name, length, overwrite=self.overwrite, rename=False) as pending:
-            shutil.copyfile(source, pending.temporary)
-        self.bytes += os.path.getsize(self.path / name)
+        with self._pending(name, os.path.getsize(source)) as temporary:
+            shutil.copyfile(source, temporary)
+
+    @contextmanager
+    def _pending(self, name: str, length: int) -> Iterator[Path]:
+        """Yield the temporary path of a file that gets its name when the block ends."""
+        path = self.path / name
+        is_new = not path.exists()
+        with pending_file(path, length, overwrite=self.overwrite, rename=False) as pending:
+            yield pending.temporary
+        if is_new:
+            self._added.append(path)
+        self.bytes += path.stat().st_size
 
 
 def _choose_file_names(sources: Sequence[StrPath], *, is_gallery: bool) -> list[tuple[str, str]]:

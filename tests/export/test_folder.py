@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -146,6 +147,30 @@ def test_a_full_disk_leaves_no_partial_file(model_file, tmp_path, monkeypatch):
     with pytest.raises(HyrfError, match=r"scene\.hyrf: the disk is full"):
         export_model(model_file, tmp_path / "p")
     assert not (tmp_path / "p").exists()
+
+
+@pytest.mark.parametrize(
+    "write", [export_model, lambda source, target, **options: export_gallery([source], target, **options)]
+)
+def test_a_full_disk_in_the_middle_leaves_what_was_there_and_the_call_can_be_repeated(
+    write, model_file, tmp_path, monkeypatch
+):
+    replace, calls = os.replace, []
+
+    def fail_third(*arguments):
+        calls.append(arguments)
+        if len(calls) == 3:
+            raise OSError(28, "No space left on device")
+        replace(*arguments)
+
+    (tmp_path / "p").mkdir()
+    (tmp_path / "p" / "notes.txt").write_text("mine")
+    with monkeypatch.context() as patch:
+        patch.setattr("hyrfpack.atomic.os.replace", fail_third)
+        with pytest.raises(HyrfError, match="the disk is full"):
+            write(model_file, tmp_path / "p")
+    assert file_names(tmp_path / "p") == {"notes.txt"}
+    assert write(model_file, tmp_path / "p", overwrite=False).bytes > 0
 
 
 def test_splats_without_extent_have_no_poster(tmp_path):
