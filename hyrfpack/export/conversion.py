@@ -17,7 +17,13 @@ from hyrfpack.config.export import ConvertConfig
 from hyrfpack.context import RunContext
 from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.export.kinds import check_package, check_spz_version, find_kind_by_ending, select_splats
+from hyrfpack.export.kinds import (
+    STREAMED_SOG_FOLDER,
+    check_package,
+    check_spz_version,
+    find_kind_by_ending,
+    select_splats,
+)
 from hyrfpack.export.measure import psnr_of_splats
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
@@ -162,7 +168,7 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
                 f"{source}: this is a model, not splats",
                 fix=f"write it with 'hyrfpack export {source} -o {target}'",
             )
-        if (Path(source) / "lod-meta.json").is_file():
+        if (Path(source) / STREAMED_SOG_FOLDER.ending).is_file():
             raise HyrfError(
                 f"{source}: this is a Streamed SOG, which has a SOG for each of its parts and levels",
                 fix="name one of the folders in it, such as 0_0",

@@ -113,6 +113,21 @@ def test_large_photos_are_reduced_when_time_is_short(posed, scene, monkeypatch, 
     assert plans[0].steps > 1000 and any("pixels" in sentence for sentence in caplog.messages)
 
 
+def test_photos_that_are_small_already_are_timed_at_the_size_asked_for(posed, scene, monkeypatch):
+    timed: list[int] = []
+
+    def cost(scene, *_):
+        timed.append(max(scene.train[0].camera.width, scene.train[0].camera.height))
+        return SceneCost(1e-3, 0.0, 0.0, 0.0, 100)
+
+    monkeypatch.setattr(minutes, "measure_scene_cost", cost)
+    monkeypatch.setattr(minutes, "CANDIDATE_PHOTO_SIZES", (24, 16, 8))
+    reading = LoadSettings(max_size=32)
+    arguments = (posed, reading, reading.load(posed), make_plan(90_000), CPU_DEVICE, monotonic() + 3000.0, 0)
+    fit_plan_to_minutes(*arguments, PictureCache(), Reporter(["training"], ignore_progress))
+    assert timed == [32]
+
+
 def test_a_long_run_has_the_measured_budget_and_a_short_one_the_default(posed, scene, monkeypatch):
     monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(0.0, 1e-5, 0.0, 0.0, 100))
     monkeypatch.setattr(decisions, "measure_budget", lambda *_: (0.5, "by a coin"))
