@@ -24,11 +24,15 @@ MAX_EXPOSURE_VALIDATION_VIEWS_PER_FOLD = 16
 MIN_EXPOSURE_VALIDATION_VIEWS = 6  # With fewer in all folds, the safe default is kept.
 MIN_EXPOSURE_ROUNDS = 2
 MIN_EXPOSURE_SPREAD_STOPS = 0.05  # Photos whose exposures have a smaller standard deviation need no gains.
+# Photos whose exposures have this standard deviation were taken with automatic exposure. Complete runs then gain from
+# gains, even if pilots find nothing, so they are learnt unless pilots lose more than MAX_EXPOSURE_LOSS_DB.
+LARGE_EXPOSURE_SPREAD_STOPS = 0.2
+MAX_EXPOSURE_LOSS_DB = 0.1
+# Where photos differ less, because of gloss or few points, say, pilots must gain this much, and at least this many
+# standard errors over the validation photos. A limit of 1 would reject sets whose long runs gain 0.8 dB.
 MIN_EXPOSURE_GAIN_DB = 0.1
-# A gain must also be at least this many standard errors over the validation photos. A limit of 1 would reject sets
-# whose long runs gain 0.8 dB, because long runs gain more than pilots.
 MIN_GAIN_STANDARD_ERRORS = 0.5
-CLEAR_GAIN_STANDARD_ERRORS = 2.0  # A gain of this many standard errors needs no further round.
+CLEAR_GAIN_STANDARD_ERRORS = 2.0  # A gain this many standard errors from the limit needs no further round.
 # Each photo's gain is clipped to this magnitude, so that a photo of unpredictable exposure cannot decide alone.
 MAX_VIEW_GAIN_DB = 3.0
 
@@ -55,10 +59,12 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
     """Measure whether learning per-image gains makes renders more like photos that were not trained on.
 
     Each round trains a pilot with gains and one without on the same fold. The decision depends on the mean gain in
-    plain PSNR over the validation photos of all rounds. Per-image gains are learnt if it is at least
-    `MIN_EXPOSURE_GAIN_DB` and at least `MIN_GAIN_STANDARD_ERRORS` times its standard error. Otherwise, or if masks
-    leave fewer than `MIN_EXPOSURE_VALIDATION_VIEWS` photos to score, none are learnt, which is the safe default. The
-    rounds end early if the mean gain is clear or not positive.
+    plain PSNR over the validation photos of all rounds. Where the photos' exposures differ by
+    `LARGE_EXPOSURE_SPREAD_STOPS`, per-image gains are learnt unless the pilots lose more than `MAX_EXPOSURE_LOSS_DB`.
+    Elsewhere they are learnt if the pilots gain at least `MIN_EXPOSURE_GAIN_DB` and at least `MIN_GAIN_STANDARD_ERRORS`
+    times the standard error. If masks leave fewer than `MIN_EXPOSURE_VALIDATION_VIEWS` photos to score, none are
+    learnt, which is the safe default. The rounds end early if the mean gain is clear, or not positive where the photos
+    differ little.
 
     Returns:
         Whether to learn per-image gains, and the reason in words.
@@ -69,23 +75,25 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
     spread = estimate_exposure_spread(pilots.scene, pilots.cache)
     if spread < MIN_EXPOSURE_SPREAD_STOPS:
         return False, f"by their tracks the photos differ by {spread:.2f} stops"
+    is_large = spread >= LARGE_EXPOSURE_SPREAD_STOPS
+    limit = -MAX_EXPOSURE_LOSS_DB if is_large else MIN_EXPOSURE_GAIN_DB
     rounds, steps = exposure_rounds(len(pilots.scene.train)), exposure_pilot_steps(pilots.config.steps)
     gains: list[float] = []  # The PSNR gain of each validation photo in dB.
     for number in range(rounds):
         gains += _gain_per_view(pilots, number, rounds, steps)
-        if gains and np.mean(gains) <= 0:
+        if gains and not is_large and np.mean(gains) <= 0:
             break
         if len(gains) >= MIN_EXPOSURE_VALIDATION_VIEWS:
             gain, error = _mean_and_standard_error(gains)
-            if gain >= CLEAR_GAIN_STANDARD_ERRORS * error:
+            if abs(gain - limit) >= CLEAR_GAIN_STANDARD_ERRORS * error:
                 break
     if len(gains) < 2:
         return False, f"masks leave {len(gains)} of the validation photos, too few to measure whether gains help"
     gain, error = _mean_and_standard_error(gains)
-    has_enough_photos = len(gains) >= MIN_EXPOSURE_VALIDATION_VIEWS
-    return has_enough_photos and gain >= max(MIN_EXPOSURE_GAIN_DB, MIN_GAIN_STANDARD_ERRORS * error), (
+    is_significant = is_large or gain >= MIN_GAIN_STANDARD_ERRORS * error
+    return len(gains) >= MIN_EXPOSURE_VALIDATION_VIEWS and gain >= limit and is_significant, (
         f"in {steps} steps gains and exposure map scored {gain:+.2f} dB of plain PSNR (standard error {error:.2f}) on "
-        f"{len(gains)} validation photos"
+        f"{len(gains)} validation photos; the limit is {limit:+.2f} dB"
     )
 
 
