@@ -165,7 +165,7 @@ def _test_kernels(device: torch.device, problems: list[str]) -> SelfTest | None:
             problems.append(
                 "compiled kernels cannot be stored, so each run compiles them again; set a folder in NUMBA_CACHE_DIR"
             )
-    _LOG.info("testing the kernels; where they are not compiled yet, this takes up to a minute")
+    _LOG.info("testing the kernels; where they are not compiled yet, this takes up to two minutes")
     test = run_self_test(implementation, device)
     if implementation == "gpu":
         store_self_test(test, device)

@@ -51,11 +51,11 @@ FULL_RUN_OVERHEAD_SECONDS = 60.0  # what the full run takes besides its training
 # Each part has a module with `items(setup)` and `run(item, setup)`, and a time limit in seconds for all its items. The
 # limits of the first two parts include the first build of 140 kernels, each of which takes 1 or 2 seconds of a core.
 CHECK_PARTS = {
-    "self-test": ("tools.gpu.first_contact", 100.0),
+    "self-test": ("tools.gpu.first_contact", 140.0),
     "tests": ("tools.gpu.tests", 150.0),
-    "kernels": ("tools.gpu.kernels", 60.0),
-    "frames": ("tools.gpu.frames", 120.0),
-    "sanitizer": ("tools.gpu.sanitizer", 90.0),
+    "kernels": ("tools.gpu.kernels", 50.0),
+    "frames": ("tools.gpu.frames", 105.0),
+    "sanitizer": ("tools.gpu.sanitizer", 75.0),
     "repeat": ("tools.gpu.repeat", 20.0),
     "quality": ("tools.gpu.quality", 170.0),
     "ranks": ("tools.gpu.ranks", 150.0),
