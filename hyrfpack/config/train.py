@@ -120,14 +120,15 @@ class TrainConfig:
     `hyrfpack.train_model` also measures the factor before a run of at least 2,000 steps on at least eight photos
     (`hyrfpack.train.budget_pilots`). During the run there may be `DensityConfig.excess` times as many Gaussians. Pilot
     runs decide `exposure`, too (`hyrfpack.train.exposure_pilots`), and before a run of more than 3,000 steps on 8 to 30
-    photos whether fewer steps are enough (`hyrfpack.train.length_pilots`). A `Trainer` by itself makes no pilot runs:
-    it takes all steps, and learns no gains unless `exposure` is True. The hash grid whose rows `log2_table_size` states
-    is that of radiance (None: by the budget); the geometry grid has half as many. The background colour "random" is a
-    new one in each step, and the model's own background is then black.
+    photos, or of at least 20,000 on 31 to 100, whether fewer steps are enough (`hyrfpack.train.length_pilots`). A
+    `Trainer` by itself makes no pilot runs: it takes all steps, and learns no gains unless `exposure` is True. The hash
+    grid whose rows `log2_table_size` states is that of radiance (None: by the budget); the geometry grid has half as
+    many. The background colour "random" is a new one in each step, and the model's own background is then black.
 
     Attributes:
         steps: training steps.
-        early_stop: shorten a run of over 3,000 steps on 8 to 30 photos where pilot runs show that more do not help.
+        early_stop: shorten a run of over 3,000 steps on 8 to 30 photos, or of 20,000 or more on up to 100, where pilot
+            runs show that more do not help.
         resolution_schedule: train most steps on reduced photos if photos are large and Gaussians few.
         seed: random seed. On a CPU, the same seed gives the same file.
         preset: kind of scene; auto detects it.

@@ -18,7 +18,13 @@ from hyrfpack.train.exposure_pilots import (
     exposure_rounds,
     measure_exposure,
 )
-from hyrfpack.train.length_pilots import measure_length, pilot_lengths
+from hyrfpack.train.length_pilots import (
+    FEW_PHOTOS,
+    MIN_LENGTH_RATIO,
+    PILOT_LENGTHS_STEPS,
+    measure_length,
+    pilot_lengths,
+)
 from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, PilotScore, PilotsStopped, ScenePilots
 from hyrfpack.train.trainer import Trainer
 
@@ -27,7 +33,7 @@ MIN_BUDGET_STEPS = 2_000
 MIN_EXPOSURE_STEPS = 1_000
 # Longer pilots take as long as the run itself. They pay only where a longer run is likely to overfit.
 MAX_UNMEASURED_STEPS = 3_000
-MAX_LENGTH_TRAINING_VIEWS = 30
+MAX_LENGTH_TRAINING_VIEWS = 100
 MAX_BUDGET_PILOT_STEPS = 2 * MAX_BUDGET_ROUNDS * BUDGET_PILOT_STEPS
 
 
@@ -63,7 +69,7 @@ def measures_exposure(scene: Scene, config: TrainConfig) -> bool:
 
 
 def measures_length(scene: Scene, config: TrainConfig) -> bool:
-    """Return whether pilots choose the number of steps: `early_stop` is on, the run is long and photos are few."""
+    """Return whether pilots choose the number of steps: `early_stop` is on, and the run is long for its photos."""
     return config.early_stop and max_length_pilot_steps(len(scene.train), config.steps) > 0
 
 
@@ -77,7 +83,7 @@ def chosen_steps(scene: Scene, config: TrainConfig, steps: object) -> int:
     Returns:
         `steps` if pilots may have chosen it for a run with these settings, else `config.steps`.
     """
-    could_be_chosen = measures_length(scene, config) and steps in pilot_lengths(config.steps)
+    could_be_chosen = measures_length(scene, config) and steps in pilot_lengths(config.steps, len(scene.train))
     return steps if could_be_chosen and isinstance(steps, int) else config.steps
 
 
@@ -96,8 +102,10 @@ def max_exposure_pilot_steps(count: int, steps: int) -> int:
 
 def max_length_pilot_steps(count: int, steps: int) -> int:
     """Return the most steps that the pilots for the length take before a run of `steps` steps on `count` photos."""
-    is_measured = steps > MAX_UNMEASURED_STEPS and MIN_TRAINING_VIEWS <= count <= MAX_LENGTH_TRAINING_VIEWS
-    return sum(pilot_lengths(steps)) * is_measured
+    if not MIN_TRAINING_VIEWS <= count <= MAX_LENGTH_TRAINING_VIEWS:
+        return 0
+    shortest = MAX_UNMEASURED_STEPS + 1 if count <= FEW_PHOTOS else MIN_LENGTH_RATIO * PILOT_LENGTHS_STEPS[-1]
+    return sum(pilot_lengths(steps, count)) * (steps >= shortest)
 
 
 def without_pilots(config: TrainConfig) -> Decisions:

@@ -14,12 +14,21 @@ from hyrfpack.train.setup import budget_for
 
 PILOT_LENGTHS_STEPS = (1_000, 3_000, 10_000)
 MIN_LENGTH_RATIO = 2  # The run is at least this many times as long as any shorter pilot.
+# With at most this many training photos, a run of any pilot length may be too long. With more, only runs that are
+# MIN_LENGTH_RATIO times as long as the longest pilot are measured, and not against the shortest.
+FEW_PHOTOS = 30
 LENGTH_VALIDATION_EVERY = 4  # One in this many training photos is a validation photo.
 
 
-def pilot_lengths(steps: int) -> list[int]:
-    """Return the numbers of steps that are compared for a run of `steps` steps; the last one is `steps`."""
-    return [*(length for length in PILOT_LENGTHS_STEPS if MIN_LENGTH_RATIO * length <= steps), steps]
+def pilot_lengths(steps: int, photos: int) -> list[int]:
+    """Return the numbers of steps that are compared for a run of `steps` steps; the last one is `steps`.
+
+    Args:
+        steps: number of steps of the run.
+        photos: number of its training photos.
+    """
+    candidates = PILOT_LENGTHS_STEPS if photos <= FEW_PHOTOS else PILOT_LENGTHS_STEPS[1:]
+    return [*(length for length in candidates if MIN_LENGTH_RATIO * length <= steps), steps]
 
 
 def measure_length(pilots: ScenePilots, exposure: bool, budget_factor: float | None) -> tuple[int, str]:
@@ -40,7 +49,7 @@ def measure_length(pilots: ScenePilots, exposure: bool, budget_factor: float | N
     Raises:
         PilotsStopped, HyrfError: as `ScenePilots.run`.
     """
-    lengths = pilot_lengths(pilots.config.steps)
+    lengths = pilot_lengths(pilots.config.steps, len(pilots.scene.train))
     fold = pilots.fold(LENGTH_VALIDATION_EVERY)
     if not fold.validation:
         return lengths[-1], "masks leave no pixel of the validation photos"

@@ -474,9 +474,17 @@ def test_photos_without_validation_photos_get_the_whole_run():
     assert not runs.scores
 
 
-@pytest.mark.parametrize(("steps", "lengths"), [(3_001, [1_000, 3_001]), (6_000, [1_000, 3_000, 6_000])])
-def test_pilots_are_at_most_half_as_long_as_the_run(steps, lengths):
-    assert length_pilots.pilot_lengths(steps) == lengths
+@pytest.mark.parametrize(
+    ("steps", "photos", "lengths"),
+    [
+        (3_001, 8, [1_000, 3_001]),
+        (6_000, 30, [1_000, 3_000, 6_000]),
+        (20_000, 31, [3_000, 10_000, 20_000]),
+        (30_000, 30, [1_000, 3_000, 10_000, 30_000]),
+    ],
+)
+def test_pilots_are_at_most_half_as_long_as_the_run(steps, photos, lengths):
+    assert length_pilots.pilot_lengths(steps, photos) == lengths
 
 
 @pytest.mark.parametrize(
@@ -487,7 +495,12 @@ def test_pilots_are_at_most_half_as_long_as_the_run(steps, lengths):
         ({}, 7, False),
         ({}, 31, False),
         ({"steps": 3_000}, 8, False),
+        ({"steps": 19_999}, 31, False),
+        ({"steps": 20_000}, 31, True),
+        ({"steps": 20_000}, 100, True),
+        ({"steps": 20_000}, 101, False),
         ({"early_stop": False}, 8, False),
+        ({"steps": 20_000, "early_stop": False}, 31, False),
     ],
 )
 def test_only_long_runs_on_few_photos_may_be_shortened(change, views, expected):
