@@ -56,9 +56,11 @@ def short_pilots(monkeypatch) -> None:
     monkeypatch.setattr(budget_pilots, "BUDGET_PILOT_STEPS", 6)
 
 
-def make_evaluation(psnr: float, corrected: float = 0.0, apart: tuple[float, ...] = (0.0, 0.0)) -> Evaluation:
-    views = [ViewScore("view", psnr + part, None, corrected, 0.5, None) for part in apart]
-    return Evaluation(psnr, None, corrected, 0.5, None, "", 0, 0.0, views)
+def make_evaluation(
+    psnr: float, corrected: float = 0.0, apart: tuple[float, ...] = (0.0, 0.0), ssim: float = 0.5
+) -> Evaluation:
+    views = [ViewScore("view", psnr + part, None, corrected, ssim, None) for part in apart]
+    return Evaluation(psnr, None, corrected, ssim, None, "", 0, 0.0, views)
 
 
 @pytest.fixture
@@ -75,7 +77,8 @@ def scores(monkeypatch) -> dict:
 
     def evaluate(config, views, progress):
         if config.steps in table:
-            return make_evaluation(table[config.steps])
+            psnr, ssim = table[config.steps] if isinstance(table[config.steps], tuple) else (table[config.steps], 0.5)
+            return make_evaluation(psnr, ssim=ssim)
         if config.exposure in table:
             return make_evaluation(
                 table[config.exposure][config.seed],
@@ -451,7 +454,14 @@ def test_a_longer_run_is_chosen_only_while_validation_photos_score_higher(scores
     choice, reason, runs = measure_scene_length(steps)
     assert choice == chosen
     assert [score.steps for score in runs.scores] == measured and all(score.exposure for score in runs.scores)
-    assert all(f"{length:,} steps {by_steps[length]:.2f} dB" in reason for length in measured)
+    assert all(f"{length:,} steps {by_steps[length]:.2f} dB, 0.500" in reason for length in measured)
+
+
+@pytest.mark.parametrize(("psnr", "ssim", "chosen"), [(19.9, 0.803, 7_000), (19.9, 0.802, 1_000), (20.1, 0.797, 1_000)])
+def test_ssim_counts_in_the_choice_of_the_length(scores, psnr, ssim, chosen):
+    scores |= {1000: (20.0, 0.8), 3000: (psnr, ssim), 7000: (25.0, 0.8)}
+    choice, reason, _ = measure_scene_length(7_000)
+    assert choice == chosen and f"3,000 steps {psnr:.2f} dB, {ssim:.3f}" in reason
 
 
 def test_each_length_pilot_has_the_budget_of_a_run_of_its_length(scores):
