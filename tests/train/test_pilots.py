@@ -63,9 +63,17 @@ def make_evaluation(
     return Evaluation(psnr, None, corrected, ssim, None, "", 0, 0.0, views)
 
 
+def with_ssim(score: float | tuple[float, float]) -> tuple[float, float]:
+    """Return a PSNR and an SSIM from a pair of both, or from a PSNR alone."""
+    return score if isinstance(score, tuple) else (score, 0.5)
+
+
 @pytest.fixture
 def scores(monkeypatch) -> dict:
-    """Scores of models by their steps, by their budget, or by whether they learn gains. No model is trained."""
+    """Scores of models by their steps, by their budget, or by whether they learn gains. No model is trained.
+
+    By steps or budget, a score is a PSNR or a pair of PSNR and SSIM.
+    """
     table: dict = {}
 
     class Untrained:
@@ -77,7 +85,7 @@ def scores(monkeypatch) -> dict:
 
     def evaluate(config, views, progress):
         if config.steps in table:
-            psnr, ssim = table[config.steps] if isinstance(table[config.steps], tuple) else (table[config.steps], 0.5)
+            psnr, ssim = with_ssim(table[config.steps])
             return make_evaluation(psnr, ssim=ssim)
         if config.exposure in table:
             return make_evaluation(
@@ -85,7 +93,8 @@ def scores(monkeypatch) -> dict:
                 0.0,
                 table["apart"] if config.exposure else (0.0,) * len(table["apart"]),
             )
-        return make_evaluation(0.0, table[config.max_gaussians])
+        corrected, ssim = with_ssim(table[config.max_gaussians])
+        return make_evaluation(0.0, corrected, ssim=ssim)
 
     monkeypatch.setattr(pilots, "Trainer", Untrained)
     monkeypatch.setattr(pilots, "evaluate_model", evaluate)
@@ -99,8 +108,16 @@ def scores(monkeypatch) -> dict:
 def test_the_budget_factor_follows_the_gain_of_two_doublings(scores, gain, factor):
     gain *= budget_pilots.EXPECTED_GAIN_DB
     scores |= {1250: 20.0, 5000: 20.0 + gain}
-    why = f"in {budget_pilots.BUDGET_PILOT_STEPS} steps 5,000 Gaussians scored {gain:+.2f} dB over 1,250"
+    steps = budget_pilots.BUDGET_PILOT_STEPS
+    why = f"in {steps} steps 5,000 Gaussians scored {gain:+.2f} dB and +0.000 of SSIM over 1,250"
     assert measure_scene_budget(make_scene()) == (factor, why)
+
+
+def test_ssim_counts_in_the_budget(scores):
+    half = budget_pilots.EXPECTED_GAIN_DB / 2
+    scores |= {1250: (20.0, 0.5), 5000: (20.0 + half, 0.5 + half / pilots.SSIM_WEIGHT_DB)}
+    factor, why = measure_scene_budget(make_scene())
+    assert factor == 1.0 and f"{half:+.2f} dB and {half / pilots.SSIM_WEIGHT_DB:+.3f} of SSIM" in why
 
 
 @pytest.mark.parametrize(("first", "second", "factor"), [(0.1, 0.9, 0.5), (0.9, 0.1, 0.5), (1.0, 0.0, 1.0)])
