@@ -17,7 +17,7 @@ from hyrfpack.train.pilots import SSIM_WEIGHT_DB, ScenePilots
 BUDGET_PILOT_STEPS = 120
 MAX_BUDGET_ROUNDS = 2  # Each round runs two pilots.
 SMALL_PILOT_BUDGET_RATIO = 0.25
-EXPECTED_GAIN_DB = 1.8  # If the larger pilot scores this much more, the usual budget is right.
+EXPECTED_GAIN_DB = 1.8  # If the larger pilot scores this much more, the usual budget is right. SSIM counts, too.
 # Multiples of the usual budget. The steps are wide, because another seed changes the gain by up to 0.3 dB.
 BUDGET_FACTORS = (0.25, 0.35, 0.5, 0.7, 1.0, 1.5)
 
