@@ -19,9 +19,9 @@ from hyrfpack.train.decisions import (
     MIN_BUDGET_STEPS,
     MIN_EXPOSURE_STEPS,
     max_exposure_pilot_steps,
-    max_length_pilot_steps,
     max_pilot_steps,
 )
+from hyrfpack.train.length_pilots import max_length_pilot_steps
 from hyrfpack.train.pilots import BUDGET_REFERENCE_STEPS
 from hyrfpack.train.resolution import PhotoSize
 from hyrfpack.train.setup import budget_for, estimate_initial_count, usual_budget

@@ -18,22 +18,13 @@ from hyrfpack.train.exposure_pilots import (
     exposure_rounds,
     measure_exposure,
 )
-from hyrfpack.train.length_pilots import (
-    FEW_PHOTOS,
-    MIN_LENGTH_RATIO,
-    PILOT_LENGTHS_STEPS,
-    measure_length,
-    pilot_lengths,
-)
+from hyrfpack.train.length_pilots import max_length_pilot_steps, measure_length, pilot_lengths
 from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, PilotScore, PilotsStopped, ScenePilots
 from hyrfpack.train.trainer import Trainer
 
 # Shorter runs have no pilots, which would take too large a part of their time.
 MIN_BUDGET_STEPS = 2_000
 MIN_EXPOSURE_STEPS = 1_000
-# Longer pilots take as long as the run itself. They pay only where a longer run is likely to overfit.
-MAX_UNMEASURED_STEPS = 3_000
-MAX_LENGTH_TRAINING_VIEWS = 100
 MAX_BUDGET_PILOT_STEPS = 2 * MAX_BUDGET_ROUNDS * BUDGET_PILOT_STEPS
 
 
@@ -98,14 +89,6 @@ def max_pilot_steps(scene: Scene, config: TrainConfig) -> int:
 def max_exposure_pilot_steps(count: int, steps: int) -> int:
     """Return the most steps that the pilots for exposure take before a run of `steps` steps on `count` photos."""
     return 2 * exposure_rounds(count) * exposure_pilot_steps(steps)
-
-
-def max_length_pilot_steps(count: int, steps: int) -> int:
-    """Return the most steps that the pilots for the length take before a run of `steps` steps on `count` photos."""
-    if not MIN_TRAINING_VIEWS <= count <= MAX_LENGTH_TRAINING_VIEWS:
-        return 0
-    shortest = MAX_UNMEASURED_STEPS + 1 if count <= FEW_PHOTOS else MIN_LENGTH_RATIO * PILOT_LENGTHS_STEPS[-1]
-    return sum(pilot_lengths(steps, count)) * (steps >= shortest)
 
 
 def without_pilots(config: TrainConfig) -> Decisions:

@@ -24,8 +24,8 @@ MAX_EXPOSURE_VALIDATION_VIEWS_PER_FOLD = 16
 MIN_EXPOSURE_VALIDATION_VIEWS = 6  # With fewer in all folds, the safe default is kept.
 MIN_EXPOSURE_ROUNDS = 2
 MIN_EXPOSURE_SPREAD_STOPS = 0.05  # Photos whose exposures have a smaller standard deviation need no gains.
-# Photos whose exposures have this standard deviation were taken with automatic exposure. Complete runs then score
-# higher with gains, even if pilots do not, so gains are learnt unless pilots lose more than MAX_EXPOSURE_LOSS_DB.
+# Where the photos' exposures have at least this standard deviation, complete runs scored higher with gains, even if
+# pilots did not. So gains are learnt unless pilots lose more than MAX_EXPOSURE_LOSS_DB.
 LARGE_EXPOSURE_SPREAD_STOPS = 0.2
 MAX_EXPOSURE_LOSS_DB = 0.1
 # Where photos differ less, because of gloss or few points, say, pilots must gain this much, and at least this many

@@ -9,14 +9,17 @@ from __future__ import annotations
 
 import dataclasses
 
-from hyrfpack.train.pilots import SSIM_WEIGHT_DB, ScenePilots
+from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, ScenePilots, quality_score
 from hyrfpack.train.setup import budget_for
 
 PILOT_LENGTHS_STEPS = (1_000, 3_000, 10_000)
 MIN_LENGTH_RATIO = 2  # The run is at least this many times as long as any shorter pilot.
-# With at most this many training photos, a run of any pilot length may be too long. With more, only runs that are
-# MIN_LENGTH_RATIO times as long as the longest pilot are measured, and not against the shortest.
+# Pilots take as long as the run itself. They pay only where a longer run is likely to overfit.
+MAX_UNMEASURED_STEPS = 3_000
+# With more training photos than FEW_PHOTOS, only runs that are MIN_LENGTH_RATIO times as long as the longest pilot are
+# measured, and not against the shortest. With more than MAX_MEASURED_PHOTOS, none is.
 FEW_PHOTOS = 30
+MAX_MEASURED_PHOTOS = 100
 LENGTH_VALIDATION_EVERY = 4  # One in this many training photos is a validation photo.
 
 
@@ -31,13 +34,21 @@ def pilot_lengths(steps: int, photos: int) -> list[int]:
     return [*(length for length in candidates if MIN_LENGTH_RATIO * length <= steps), steps]
 
 
+def max_length_pilot_steps(photos: int, steps: int) -> int:
+    """Return the most steps that the pilots take before a run of `steps` steps on `photos` photos; 0 without pilots."""
+    if not MIN_TRAINING_VIEWS <= photos <= MAX_MEASURED_PHOTOS:
+        return 0
+    shortest = MAX_UNMEASURED_STEPS + 1 if photos <= FEW_PHOTOS else MIN_LENGTH_RATIO * PILOT_LENGTHS_STEPS[-1]
+    return sum(pilot_lengths(steps, photos)) * (steps >= shortest)
+
+
 def measure_length(pilots: ScenePilots, exposure: bool, budget_factor: float | None) -> tuple[int, str]:
     """Measure how many steps of training make the best renders of photos that were not trained on.
 
     Pilots of all `pilot_lengths` are trained on one fold, the shortest first, until one scores no higher on the
     validation photos than the one before it. That earlier length is chosen, or the full one if every pilot scores
-    higher than the one before. The score is the mean plain PSNR plus `SSIM_WEIGHT_DB` times the mean SSIM. Each pilot
-    has the Gaussian budget of a run of its length.
+    higher than the one before. The score is the `quality_score` of mean plain PSNR and mean SSIM. Each pilot has the
+    Gaussian budget of a run of its length.
 
     Args:
         pilots: runs the pilots of the scene.
@@ -66,7 +77,7 @@ def measure_length(pilots: ScenePilots, exposure: bool, budget_factor: float | N
             exposure=exposure,
             max_gaussians=budget_for(fold.scene, config)[0],
         )
-        scores.append(pilot.psnr + SSIM_WEIGHT_DB * pilot.ssim)
+        scores.append(quality_score(pilot.psnr, pilot.ssim))
         measured.append(f"{length:,} steps {pilot.psnr:.2f} dB, {pilot.ssim:.3f}")
         if len(scores) > 1 and scores[-1] <= scores[-2]:
             break

@@ -537,7 +537,7 @@ def test_only_long_runs_on_few_photos_may_be_shortened(change, views, expected):
 
 @pytest.mark.usefixtures("signals")
 def test_a_shortened_run_resumes_to_the_same_bytes_and_names_the_reason(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(decisions, "MAX_UNMEASURED_STEPS", 10)
+    monkeypatch.setattr(length_pilots, "MAX_UNMEASURED_STEPS", 10)
     monkeypatch.setattr(length_pilots, "PILOT_LENGTHS_STEPS", (8,))
     monkeypatch.setattr(decisions, "measure_length", lambda *_: (8, "8: by a coin"))
     config = TrainConfig(steps=20)
