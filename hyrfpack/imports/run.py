@@ -211,8 +211,8 @@ def import_loaded_splats(
 
 
 def _falls_short(reached_psnr: float, asked: float) -> bool:
-    """Return whether a PSNR, rounded as in messages, is less than the target."""
-    return round(reached_psnr, 1) < asked
+    """Return whether a PSNR is less than the target, both rounded as in messages."""
+    return round(reached_psnr, 1) < round(asked, 1)
 
 
 def _shortfall(reached_psnr: float, unpacked_psnr: float, config: ImportConfig, *, has_cameras: bool) -> str:

@@ -187,6 +187,7 @@ def test_a_missed_target_advises_another_psnr() -> None:
     assert "reaches 36.5" in messages and messages.endswith("set a higher target with `psnr`")
     assert "set a lower `psnr`" in run._shortfall(55, 56, ImportConfig(psnr=60), has_cameras=False)
     assert not run._falls_short(36.96, 37) and run._falls_short(36.94, 37)
+    assert not run._falls_short(37.04, 37.04)
 
 
 def test_a_target_missed_with_few_cameras_advises_more_cameras(
