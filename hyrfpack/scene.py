@@ -177,17 +177,20 @@ class Picture:
 class View:
     """One photo with its camera. The photo is read and decoded only when `load` is called.
 
-    Two views are equal if their name, camera and `load` are equal.
+    Two views are equal if all their attributes are.
 
     Attributes:
         name: the photo's path below the picture folder, with its extension ("DSCF5565.jpg", "left/0001.png").
         camera: the camera after undistortion; its size is the size of the loaded picture.
         load: returns the Picture, whose size has been checked against the camera.
+        is_resampled: whether the camera does not fit the stored photo even after scaling, because the picture is
+            undistorted, or cut from a panorama.
     """
 
     name: str
     camera: Camera
     load: Callable[[], Picture]
+    is_resampled: bool = False
 
 
 @dataclass(frozen=True, eq=False)

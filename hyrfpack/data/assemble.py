@@ -316,8 +316,9 @@ def _make_view(photo: Photo, max_size: int) -> View:
     pose = _orthonormal_pose(photo.camera_from_world, photo.path)
     camera = Camera(*size, lens.fx, lens.fy, lens.cx, lens.cy, pose)
     if photo.face is not None:
-        return View(photo.name, camera, FaceFile(photo.path, whole, photo.face, size[0], photo.mask))
-    return View(photo.name, camera, PhotoFile(photo.path, header.size, lens, photo.mask, photo.orientation))
+        return View(photo.name, camera, FaceFile(photo.path, whole, photo.face, size[0], photo.mask), is_resampled=True)
+    load = PhotoFile(photo.path, header.size, lens, photo.mask, photo.orientation)
+    return View(photo.name, camera, load, is_resampled=lens.is_distorted)
 
 
 def _is_plausible(lens: Lens) -> bool:

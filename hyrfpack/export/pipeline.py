@@ -149,7 +149,7 @@ def _export_file(
         if kind is HTML_PAGE and not config.baked:
             return write_native_page(loaded, source, target, config, overwrite)
         if kind in (TRANSFORMS_JSON, COLMAP_FOLDER):
-            _check_cameras(loaded, source)
+            _check_cameras(loaded, source, data)
         if kind is TRANSFORMS_JSON:
             return _write_cameras(loaded, target, overwrite)
         with context.open_progress("export") as progress:
@@ -201,15 +201,30 @@ def _export_levels(
     return measure_export(report, loaded, baked.finest, written, kind, part_of_progress(progress, 0.8, 1.0))
 
 
-def _check_cameras(loaded: Source, source: str | os.PathLike[str]) -> None:
-    """Raise HyrfError if the model has no cameras that are precise enough to export."""
-    if loaded.cameras and not loaded.has_coarse_cameras:
+def _check_cameras(loaded: Source, source: str | os.PathLike[str], data: Scene | None) -> None:
+    """Raise HyrfError if no cameras are precise enough, or if they would not fit the photos on disk.
+
+    It warns if nobody knows which photo a camera belongs to.
+    """
+    if not loaded.cameras or loaded.has_coarse_cameras:
+        kept = "only coarse cameras" if loaded.has_coarse_cameras else "no cameras"
+        raise HyrfError(
+            f"{source}: it keeps {kept}",
+            fix="export the cameras from the file that training wrote, or give the photos with `data`",
+        )
+    if data is None:
+        _LOG.warning(
+            f"{source} does not keep the names of its photos, so the cameras are named {loaded.cameras[0][0]} and so "
+            "on, and are those of undistorted photos; give the photos with `data`"
+        )
         return
-    kept = "only coarse cameras" if loaded.has_coarse_cameras else "no cameras"
-    raise HyrfError(
-        f"{source}: it keeps {kept}",
-        fix="export the cameras from the file that training wrote, or give the photos with `data`",
-    )
+    resampled = [view.name for view in data.train if view.is_resampled]
+    if resampled:
+        raise HyrfError(
+            f"{data.path}: {len(resampled):,} of {len(data.train):,} photos (such as {resampled[0]}) are undistorted "
+            "as they are loaded, or cut from panoramas, so the model's cameras do not fit the files",
+            fix="undistort the photos (COLMAP's image_undistorter) and give the new folder with `data`",
+        )
 
 
 def _write_cameras(loaded: Source, target: str | os.PathLike[str], overwrite: bool) -> ExportReport:

@@ -37,7 +37,8 @@ class Source:
     Attributes:
         model: the model; the scene of a merged file, its first part.
         drawn: what is shown and exported: `model`, or all parts of a merged file.
-        cameras: names and cameras of the training photos; empty if the file keeps none and no photos are given.
+        cameras: names and cameras of the training photos; empty if the file keeps none and no photos are given. Files
+            keep no names, so without photos these are "camera-0000.png" and so on.
         fit_cameras: cameras at which colours are fitted; made-up ones around the scene if none are known.
         measured_views: cameras at which the loss is measured, with their photos or None. They are not fitted, unless
             there are fewer than MIN_CAMERAS_TO_HOLD_OUT cameras in all.
@@ -91,7 +92,7 @@ class Source:
             between = evenly_spaced(cameras[1::2], MAX_MEASURED_VIEWS)
             measured_views = [(camera, None) for camera in between]
             return cls(model, drawn, [], _make_ring_cameras(viewpoint, center, up), measured_views, up, center, stated)
-        named = [(f"{number:04d}.png", camera) for number, camera in enumerate(cameras)]
+        named = [(f"camera-{number:04d}.png", camera) for number, camera in enumerate(cameras)]
         spare = cameras[::HELD_OUT_INTERVAL] if len(cameras) >= MIN_CAMERAS_TO_HOLD_OUT else cameras
         fit_cameras = (
             [c for number, c in enumerate(cameras) if number % HELD_OUT_INTERVAL]

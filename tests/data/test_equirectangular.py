@@ -180,6 +180,7 @@ def test_a_split_of_panoramas_includes_all_their_faces(tmp_path):
     scene = load_scene(tmp_path)
 
     assert {view.name[0] for view in scene.train} == {"a"} and {view.name[0] for view in scene.test} == {"b"}
+    assert all(view.is_resampled for view in scene.views)
 
 
 def test_whole_panoramas_are_held_out(tmp_path):

@@ -137,6 +137,30 @@ def test_transforms_json_contains_the_cameras_without_a_bake(plain_file, tmp_pat
     assert (report.cameras, report.gaussians, report.bytes) == (4, 0, (tmp_path / "transforms.json").stat().st_size)
 
 
+def test_cameras_without_names_of_photos_get_names_that_no_photo_has(plain_file, tmp_path, caplog):
+    export(plain_file, tmp_path / "transforms.json")
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == [f"images/camera-000{number}.png" for number in range(4)]
+    assert any("does not keep the names of its photos" in message for message in caplog.messages)
+
+
+def test_exported_cameras_have_the_names_of_the_given_photos(plain_file, tmp_path, caplog):
+    scene = ball_scene(views=4, side=8)
+    export(plain_file, tmp_path / "transforms.json", data=scene)
+    frames = json.loads((tmp_path / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == [f"images/{view.name}" for view in scene.train]
+    assert not any("names of its photos" in message for message in caplog.messages)
+
+
+@pytest.mark.parametrize("target", ["transforms.json", "colmap"])
+def test_cameras_that_do_not_fit_the_photos_on_disk_are_refused(plain_file, tmp_path, target):
+    scene = ball_scene(views=4, side=8)
+    scene = replace(scene, train=[replace(scene.train[0], is_resampled=True), *scene.train[1:]])
+    with pytest.raises(HyrfError, match=f"1 of {len(scene.train)} photos .* do not fit the files"):
+        export(plain_file, tmp_path / target, data=scene)
+    assert not (tmp_path / target).exists()
+
+
 def test_a_colmap_export_writes_a_model_and_reports_its_size(plain_file, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     (tmp_path / "colmap").mkdir()
