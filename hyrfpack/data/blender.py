@@ -43,6 +43,7 @@ def read_blender(path: Path, *, test_every: int, max_size: int) -> Scene:
         max_size=max_size,
         test_names=test_names,
         tables=tables,
+        masks=path / "masks",
         notes=notes,
     )
 
@@ -64,7 +65,7 @@ def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:
             missing.append(str(PurePosixPath(frame["file_path"])))
             continue
         header = read_header(picture)
-        focal = focal_from_angle(angle, header.width, file)
+        focal = focal_from_angle(angle, header.width, file, "camera_angle_x")
         lens = Lens(header.width, header.height, focal, focal, header.width / 2, header.height / 2)
         name = index.photo_name(picture, frame["file_path"])
         photos.append(Photo(name, picture, header, lens, pose_from_opengl(frame, file)))

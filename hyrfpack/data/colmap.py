@@ -20,6 +20,7 @@ from hyrfpack.data.names import PictureIndex, safe_name
 from hyrfpack.data.pictures import read_header
 from hyrfpack.data.points import read_ply_points
 from hyrfpack.data.search import COLMAP_TABLES, describe_subfolders, find_photo_folder, find_workspace
+from hyrfpack.data.sidecar_files import find_picture_folder
 from hyrfpack.data.undistort import Lens, brown_coefficients
 from hyrfpack.errors import HyrfDataError, needs_package, short_reason
 from hyrfpack.scene import Scene
@@ -104,13 +105,8 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
 def _photo_folder(path: Path, base: Path, images: str | None, names: Sequence[str]) -> Path:
     """Find the folder of the photos: `images` if it is given, otherwise one in the workspace or in the scene folder."""
     if images is not None:
-        named = next((parent / images for parent in (path, base) if os.path.isdir(parent / images)), None)
-        if named is None:
-            raise HyrfDataError(
-                f"{path}: there is no photo folder '{images}', and {describe_subfolders(path)}",
-                fix="use another folder of photos as `images`",
-            )
-        return named
+        holder = next((parent for parent in (path, base) if os.path.isdir(parent / images)), path)
+        return find_picture_folder(holder, images)
     found = find_photo_folder(base) or find_photo_folder(path)
     if found is None:  # the cameras of a rig have one folder each, and the listed names begin with these folders
         found = next((parent for parent in (base, path) if any(os.path.isfile(parent / name) for name in names)), None)

@@ -14,7 +14,8 @@ from hyrfpack.data.masks import find_mask_folder
 from hyrfpack.data.names import NameMatches, PictureIndex, path_parts, safe_name
 from hyrfpack.data.pictures import PictureHeader, read_header
 from hyrfpack.data.points import read_ply_points
-from hyrfpack.data.search import describe_subfolders, find_photo_folder
+from hyrfpack.data.search import find_photo_folder
+from hyrfpack.data.sidecar_files import find_picture_folder
 from hyrfpack.data.transforms import (
     finite_number,
     focal_from_angle,
@@ -51,11 +52,8 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size
     file = path / "transforms.json"
     content = read_transforms(file)
     frames = content["frames"]
-    if images is not None and not (path / images).is_dir():
-        raise HyrfDataError(
-            f"{path}: there is no photo folder '{images}', and {describe_subfolders(path)}",
-            fix="use another folder of photos as `images`",
-        )
+    if images is not None:
+        find_picture_folder(path, images)
     keep, test_names, notes = _listed_split(content, file)
     frames = [frame for frame in frames if keep is None or PurePosixPath(frame["file_path"]) in keep]
     strip = _common_folder([frame["file_path"] for frame in content["frames"]])
@@ -196,9 +194,11 @@ def _lens(content: dict[str, Any], frame: dict[str, Any], header: PictureHeader,
     fx, fy = value("fl_x"), value("fl_y")
     angle_x, angle_y = value("camera_angle_x"), value("camera_angle_y")
     if fx is None and angle_x is not None:
-        fx = focal_from_angle(angle_x, width, file)
+        fx = focal_from_angle(angle_x, width, file, "camera_angle_x")
     if fy is None:
-        fy = focal_from_angle(angle_y, height, file) if angle_y is not None and value("fl_x") is None else fx
+        fy = fx
+        if angle_y is not None and value("fl_x") is None:
+            fy = focal_from_angle(angle_y, height, file, "camera_angle_y")
     if fx is None:
         fx = fy
     if fx is None or fy is None:

@@ -73,13 +73,13 @@ def finite_number(entries: dict[str, Any], key: str, path: Path) -> float | None
     return float(value)
 
 
-def focal_from_angle(angle: float, size: int, path: Path) -> float:
+def focal_from_angle(angle: float, size: int, path: Path, key: str) -> float:
     """Convert a field of view to a focal length in pixels: size / (2 tan(angle / 2)).
 
     Args:
         angle: field of view in radians.
         size: pixels that the field of view covers.
-        path: the file, for the error message.
+        path, key: the file and the angle's key in it, for the error message.
 
     Raises:
         HyrfDataError: the angle is not between 0 and pi.
@@ -87,7 +87,7 @@ def focal_from_angle(angle: float, size: int, path: Path) -> float:
     if not 0 < angle < math.pi or 0.5 * angle == 0:  # half of the smallest positive float is 0
         raise HyrfDataError(
             f"{path}: a field of view of {angle:g} radians is outside (0, pi)",
-            fix="correct 'camera_angle_x'",
+            fix=f"correct '{key}'",
         )
     return 0.5 * size / math.tan(0.5 * angle)
 

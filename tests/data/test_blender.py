@@ -44,6 +44,20 @@ def test_set_keeps_its_own_split_poses_and_straight_alpha(tmp_path, opengl_frame
     np.testing.assert_array_equal(scene.train[1].load().alpha, stored[..., 3])
 
 
+def test_masks_beside_the_photos_are_applied(tmp_path, opengl_frames):
+    write_blender(tmp_path, opengl_frames)
+    mask = np.full((20, 30), 255, np.uint8)
+    mask[:, :10] = 0
+    (tmp_path / "masks" / "train").mkdir(parents=True)
+    Image.fromarray(mask).save(tmp_path / "masks" / "train" / "r_1.png")
+
+    scene = load_scene(tmp_path)
+
+    np.testing.assert_array_equal(scene.train[1].load().mask, mask > 0)
+    assert scene.train[0].load().mask is None
+    assert "1 of 6 photos has a mask" in scene.notes
+
+
 def test_the_val_split_replaces_a_missing_test_split(tmp_path, opengl_frames):
     write_blender(tmp_path, opengl_frames, splits=("train", "val"))
 

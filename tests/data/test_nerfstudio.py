@@ -45,6 +45,24 @@ def test_intrinsics_of_a_frame_override_global_ones(nerfstudio_folder):
     assert views[1].camera.intrinsics == (30.0, 31.0, 17.0, 11.0)
 
 
+@pytest.mark.parametrize("images", ["images_9", "x" * 300])
+def test_a_missing_photo_folder_is_a_clear_error(nerfstudio_folder, images):
+    with pytest.raises(HyrfDataError, match="no photo folder"):
+        load_scene(nerfstudio_folder(), images=images)
+
+
+@pytest.mark.parametrize("key", ["camera_angle_x", "camera_angle_y"])
+def test_an_impossible_field_of_view_names_its_key(nerfstudio_folder, key):
+    root = nerfstudio_folder(fl_x=None, fl_y=None, **{"camera_angle_x": 1.0, "camera_angle_y": 1.0, key: 4.0})
+    with pytest.raises(HyrfDataError, match=f"4 radians is outside .*; correct '{key}'"):
+        load_scene(root)
+
+
+@pytest.mark.parametrize(("coefficients", "is_resampled"), [({}, False), ({"k1": 0.1}, True)])
+def test_views_of_distorted_photos_are_marked_as_resampled(nerfstudio_folder, coefficients, is_resampled):
+    assert {view.is_resampled for view in load_scene(nerfstudio_folder(**coefficients)).views} == {is_resampled}
+
+
 def test_the_field_of_view_replaces_a_missing_focal_length(nerfstudio_folder):
     root = nerfstudio_folder(fl_x=None, fl_y=None, cx=None, cy=None, w=None, h=None, camera_angle_x=1.0)
 
