@@ -72,6 +72,8 @@ CUBE_FACES = (
 class FaceFile:
     """A face of a panorama on disk; calling it loads the Picture.
 
+    Transparent pixels of a panorama, such as a tripod that was cut out, are ignored like masked ones.
+
     Attributes:
         path: the panorama.
         stored: (width, height) of the panorama in pixels.
@@ -102,10 +104,9 @@ class FaceFile:
                 np.clip(np.rint(row), 0, len(whole) - 1).astype(int), np.rint(column).astype(int) % rgb.shape[1]
             ]
         if alpha is not None and alpha.min() < 255:
-            alpha = cut_face(alpha[..., None], self.face, self.size)[..., 0]
-        else:
-            alpha = None
-        return Picture(cut_face(rgb, self.face, self.size), alpha, mask)
+            is_opaque = cut_face(alpha[..., None], self.face, self.size)[..., 0] == 255
+            mask = is_opaque if mask is None else mask & is_opaque
+        return Picture(cut_face(rgb, self.face, self.size), None, mask)
 
 
 def face_size(width: int) -> int:

@@ -171,6 +171,19 @@ def test_faces_are_reduced_and_masked_with_their_panorama(tmp_path):
     assert views["b_down.png"].mask is None
 
 
+def test_transparent_pixels_of_a_panorama_are_ignored_like_masked_ones(tmp_path):
+    write_posed_panoramas(tmp_path)
+    alpha = np.full((128, 256), 255, np.uint8)
+    alpha[100:] = 0  # a tripod that was cut out
+    Image.fromarray(np.dstack([render_panorama(128), alpha])).save(tmp_path / "images" / "a.png")
+
+    views = {view.name: view.load() for view in load_scene(tmp_path, test_every=0).views}
+
+    assert all(picture.alpha is None for picture in views.values())
+    assert not views["a_down.png"].mask[15:25, 15:25].any() and views["a_up.png"].mask.all()
+    assert views["b_down.png"].mask is None
+
+
 def test_a_split_of_panoramas_includes_all_their_faces(tmp_path):
     write_posed_panoramas(tmp_path, 64)
     content = json.loads((tmp_path / "transforms.json").read_text())
