@@ -126,7 +126,7 @@ def _unmatched_mask_notes(folder: Path, unmatched: list[Path], count: int, names
         return []
     of_masks = f"of {count} masks in {folder.name}"
     return [
-        f"{format_count(len(unmatched), f'{of_masks} matches', f'{of_masks} match')} no posed photo (such as "
+        f"{format_count(len(unmatched), f'{of_masks} matches', f'{of_masks} match')} no photo of the scene (such as "
         f"{unmatched[0].relative_to(folder)}); give each the name of its photo"
         f"{f' (such as {names[0]})' if names else ''}"
     ]

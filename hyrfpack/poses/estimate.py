@@ -17,6 +17,7 @@ from hyrfpack.counts import format_count
 from hyrfpack.data.archive import archive_paths_in_errors, is_archive, unpack
 from hyrfpack.data.equirectangular import CUBE_FACES
 from hyrfpack.data.folder import list_photos, list_pictures, list_raw_photos
+from hyrfpack.data.masks import MaskMatches
 from hyrfpack.data.unusable import raise_if_single_photo, raw_photos_notes, unreadable_sentences
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.lock import exclusive_folder
@@ -209,7 +210,9 @@ class _PoseEstimation:
         self.photo_count = len(photos) + len(self.left_out)
         diagnosis.check_photo_count(self.given_path, root, len(photos), self.left_out)
         self.user_names = self._map_user_names(photos)
-        masks = find_masks(photos, mask_folder) if mask_folder else {}
+        found_masks = find_masks(photos, mask_folder, not copies_photos) if mask_folder else MaskMatches()
+        masks = found_masks.by_photo
+        self._add_notes(found_masks.notes, logging.WARNING)
         if self.masks is not None and not masks:
             raise HyrfDataError(
                 f"{self.masks}: no mask has the name of a photo ({photos[0].source}.png)",

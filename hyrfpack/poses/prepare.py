@@ -19,6 +19,7 @@ from hyrfpack.data import masks as mask_files
 from hyrfpack.data.archive import display_path
 from hyrfpack.data.equirectangular import CUBE_FACES, Face, FaceFile, cut_panorama, face_lens, face_size, is_panorama
 from hyrfpack.data.folder import PhotoFacts, read_photo_facts
+from hyrfpack.data.masks import MaskMatches, check_mask_shape
 from hyrfpack.data.pictures import open_picture, read_header
 from hyrfpack.errors import HyrfDataError, short_reason, strip_path
 from hyrfpack.poses.job import Device
@@ -59,6 +60,14 @@ class Photo:
     def is_usable_unchanged(self) -> bool:
         """Return whether the source file can be used without rewriting it."""
         return self.face is None and self.facts.orientation == 1 and self.facts.path.suffix.lower() in _COPIED_SUFFIXES
+
+    def source_size(self, in_place: bool) -> tuple[int, int]:
+        """Return the (width, height) in pixels of the source picture, as stored if it is used `in_place`, else upright.
+
+        The source of a face is the panorama.
+        """
+        size = self.facts.size if self.face is None else read_header(self.facts.path).size
+        return size[::-1] if in_place and self.facts.orientation >= 5 else size
 
 
 def read_headers(
@@ -142,8 +151,7 @@ def group_by_device(photos: Sequence[Photo], in_place: bool) -> tuple[tuple[Devi
     device_of = []
     for photo in photos:
         facts = photo.facts
-        turned = in_place and facts.orientation >= 5  # a picture used in place stays as it is stored
-        size = facts.size[::-1] if turned else facts.size
+        size = facts.size if photo.face else photo.source_size(in_place)
         zoom = None if facts.focal is None else round(facts.focal / max(size), 2)
         key = (str(PurePosixPath(photo.name).parent), facts.device, size, zoom)
         if key not in devices:
@@ -189,11 +197,24 @@ def make_images(photos: Sequence[Photo], folder: Path, progress: Progress = igno
         progress(_count_event(_COPYING_TASK, len(whole) + number * len(CUBE_FACES), len(photos)))
 
 
-def find_masks(photos: Sequence[Photo], folder: Path) -> dict[str, Path]:
-    """Find the mask of each photo that has one; return paths by photo name."""
-    found = mask_files.find_masks(folder, [(photo.source, photo.facts.size) for photo in photos], set())
-    by_source = found.by_photo
-    return {photo.name: by_source[photo.source] for photo in photos if photo.source in by_source}
+def find_masks(photos: Sequence[Photo], folder: Path, in_place: bool) -> MaskMatches:
+    """Find the mask of each photo that has one, by the name of the photo; a face has the mask of its panorama.
+
+    Args:
+        photos: the photos.
+        folder: the folder of masks.
+        in_place: the photos are used as they are stored, and their masks with them.
+
+    Raises:
+        HyrfDataError: a mask has another aspect ratio than its photo, or cannot be read.
+    """
+    sources = {photo.source: photo for photo in photos}  # one of the faces stands for their panorama
+    sizes = {source: photo.source_size(in_place) for source, photo in sources.items()}
+    found = mask_files.find_masks(folder, list(sizes.items()), set())
+    for source, mask in found.by_photo.items():
+        check_mask_shape(mask, sizes[source], 1 if in_place else sources[source].facts.orientation)
+    by_name = {photo.name: found.by_photo[photo.source] for photo in photos if photo.source in found.by_photo}
+    return replace(found, by_photo=by_name)
 
 
 def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) -> dict[str, Path]:
@@ -205,8 +226,9 @@ def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) ->
         mask, target = masks[photo.name], folder / f"{photo.name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
         if photo.face is not None:
-            stored = read_header(photo.facts.path).size
-            usable = FaceFile(photo.facts.path, stored, photo.face, photo.facts.size[0], mask)().mask
+            usable = FaceFile(
+                photo.facts.path, photo.source_size(in_place=False), photo.face, photo.facts.size[0], mask
+            )().mask
             assert usable is not None  # a FaceFile with a mask always loads one
             Image.fromarray(usable.astype(np.uint8) * 255).save(target)
             made[photo.name] = target

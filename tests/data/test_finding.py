@@ -220,7 +220,7 @@ def test_masks_without_a_photo_are_noted(nerfstudio_folder, pictures):
     pictures(root / "masks", ["000.png", "001_mask.png", "002_mask.png"])
     (root / "masks" / "readme.txt").touch()
 
-    assert "2 of 3 masks in masks match no posed photo (such as 001_mask.png)" in notes_of_loading(root)
+    assert "2 of 3 masks in masks match no photo of the scene (such as 001_mask.png)" in notes_of_loading(root)
 
 
 def test_a_set_without_problems_has_no_notes(nerfstudio_folder, pictures):

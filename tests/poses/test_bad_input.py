@@ -102,12 +102,21 @@ def test_photos_from_one_place_are_a_clear_error(tmp_path):
     assert "all photos were taken from one place" in sentence and "a step to the side" in sentence
 
 
-def test_masks_without_matching_photos_are_a_clear_error(photos_and_poses, tmp_path):
+def test_masks_without_matching_photos_are_a_clear_error(photos_and_poses, tmp_path, caplog):
     (tmp_path / "masks").mkdir()
     for name in ("one", "two"):
         Image.new("L", PHOTO_SIZE, 255).save(tmp_path / "masks" / f"{name}.png")
     with pytest.raises(hyrfpack.HyrfDataError, match="no mask has the name of a photo"):
         hyrfpack.estimate_poses(photos_and_poses[0], tmp_path / "scene", masks=tmp_path / "masks")
+    assert "2 of 2 masks in masks match no photo of the scene (such as one.png)" in caplog.text
+
+
+def test_masks_of_another_shape_are_refused_before_photos_are_copied(tmp_path):
+    photos = save_pictures(tmp_path / "photos", random_pictures(4))
+    save_pictures(photos / "masks", [np.full((120, 120), 255, np.uint8)] * 4)
+    sentence = refused("poses", photos, "-o", tmp_path / "scene")
+    assert "00.png: the mask is 120 x 120 but its photo 160 x 120; make it the photo's size" in sentence
+    assert not (tmp_path / "scene").exists()
 
 
 def test_a_scene_folder_that_cannot_be_created_is_a_clear_error(photos_and_poses, tmp_path):

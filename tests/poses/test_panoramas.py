@@ -61,8 +61,17 @@ def test_masks_of_panoramas_are_cut_with_them(panoramas, tmp_path):
     Image.fromarray(mask).save(tmp_path / "masks" / "p0.png")
     photos, left_out = read_headers(folder, [folder / "p0.jpg"], in_place=False)
     assert len(photos) == len(CUBE_FACES) and not left_out
-    made = make_masks(photos, find_masks(photos, tmp_path / "masks"), tmp_path / "made")
+    made = make_masks(photos, find_masks(photos, tmp_path / "masks", in_place=False).by_photo, tmp_path / "made")
     usable = {name: np.asarray(Image.open(path).convert("L")) > 0 for name, path in made.items()}
     assert usable["p0_up.jpg"].all() and not usable["p0_down.jpg"].any()
     front = usable["p0_front.jpg"]
     assert front[: len(front) // 2 - 1].all() and not front[len(front) // 2 + 1 :].any()
+
+
+def test_a_mask_of_a_face_in_place_of_a_panorama_is_refused(panoramas, tmp_path):
+    folder, _ = panoramas
+    (tmp_path / "masks").mkdir()
+    Image.new("L", (100, 100), 255).save(tmp_path / "masks" / "p0.png")
+    photos, _ = read_headers(folder, [folder / "p0.jpg"], in_place=False)
+    with pytest.raises(hyrfpack.HyrfDataError, match="the mask is 100 x 100 but its photo 640 x 320"):
+        find_masks(photos, tmp_path / "masks", in_place=False)

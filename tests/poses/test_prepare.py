@@ -87,7 +87,7 @@ def test_masks_are_copied_so_that_edits_do_not_reach_the_original(tmp_path):
     (tmp_path / "masks").mkdir()
     Image.new("L", (80, 60), 255).save(tmp_path / "masks" / "a.png")
     photos, _ = read_photo_headers(tmp_path / "photos")
-    made = make_masks(photos, find_masks(photos, tmp_path / "masks"), tmp_path / "made")
+    made = make_masks(photos, find_masks(photos, tmp_path / "masks", in_place=False).by_photo, tmp_path / "made")
     assert made["a.jpg"].read_bytes() == (tmp_path / "masks" / "a.png").read_bytes()
     assert not made["a.jpg"].samefile(tmp_path / "masks" / "a.png")
 
@@ -211,11 +211,25 @@ def test_masks_are_rotated_with_their_photos(tmp_path):
         tmp_path / "masks" / "a.png"
     )
     photos, _ = read_photo_headers(tmp_path / "photos")
-    found = find_masks(photos, tmp_path / "masks")
+    found = find_masks(photos, tmp_path / "masks", in_place=False).by_photo
     assert list(found) == ["a.jpg"]
     made = make_masks(photos, found, tmp_path / "made")
     with Image.open(made["a.jpg"]) as image:
         assert np.array_equal(np.asarray(image), mask)
+
+
+@pytest.mark.parametrize("in_place, usable", [(False, {(80, 60), (60, 80)}), (True, {(60, 80)})])
+def test_a_mask_must_have_the_shape_of_its_photo(in_place, usable, tmp_path):
+    save_photo(tmp_path / "photos" / "a.jpg", upright_picture(), 6)  # stored on its side
+    (tmp_path / "masks").mkdir()
+    photos, _ = read_photo_headers(tmp_path / "photos", in_place)
+    for size in ((80, 60), (60, 80), (60, 60)):
+        Image.new("L", size, 255).save(tmp_path / "masks" / "a.png")
+        if size in usable:
+            assert list(find_masks(photos, tmp_path / "masks", in_place).by_photo) == ["a.jpg"]
+        else:
+            with pytest.raises(hyrfpack.HyrfDataError, match=f"a.png: the mask is {size[0]} x {size[1]} but its photo"):
+                find_masks(photos, tmp_path / "masks", in_place)
 
 
 def test_masked_parts_have_no_features_and_photos_without_masks_keep_theirs(tmp_path):
