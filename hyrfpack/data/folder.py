@@ -23,6 +23,10 @@ _DOWNSCALED_FOLDER = re.compile(r"images_(\d{1,4})", re.IGNORECASE)  # smaller c
 _RESULT_FILE = re.compile(r"poses\.json|metrics\.json|.*\.hyrf")  # hyrfpack wrote a folder that holds one of these
 _EXPORTED_FILES = ("lod-meta.json", "tileset.json", "hyrf-viewer.js")  # Streamed SOG, 3D Tiles, a player
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36, 24)  # equivalent focal lengths refer to it (CIPA DCG-001)
+# A focal length in EXIF is used if its ratio to the picture's diagonal lies between these limits, which are 35 mm
+# equivalents of 4.3 and 2,163 mm. Some programs write arbitrary numbers, and some cameras state the density of prints.
+_MIN_FOCAL_RATIO = 0.1
+_MAX_FOCAL_RATIO = 50.0
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # keys are values of EXIF's FocalPlaneResolutionUnit
 # Numbers of EXIF tags.
 _MAKE_TAG = 0x010F
@@ -191,8 +195,8 @@ def first_readable_photo(photos: Iterable[StrPath]) -> PhotoFacts | None:
 def read_photo_facts(path: StrPath) -> PhotoFacts:
     """Read a photo's size, orientation, focal length, camera and time of capture from its header.
 
-    The focal length follows from EXIF's 35 mm equivalent, f = f35 / 43.27 mm * diagonal in pixels. Without that it is
-    the focal length in mm times the pixels per mm of the sensor. No pixel is decoded.
+    The focal length follows from EXIF's 35 mm equivalent, f = f35 / 43.27 mm * diagonal in pixels. Without a plausible
+    one it is the focal length in mm times the pixels per mm of the sensor. No pixel is decoded.
 
     Args:
         path: the photo.
@@ -221,19 +225,27 @@ def read_photo_facts(path: StrPath) -> PhotoFacts:
 
 
 def _focal_in_pixels(tags: dict[int, Any], width: int, height: int) -> float | None:
-    """Compute the focal length in pixels from EXIF tags; return None if they do not state it."""
-    equivalent, diagonal = _positive(tags.get(_FOCAL_LENGTH_35MM_TAG)), math.hypot(width, height)
-    if equivalent:
-        return equivalent / _FULL_FRAME_DIAGONAL_MM * diagonal
+    """Compute the focal length in pixels from EXIF tags; return None if they state no plausible one."""
+    ratios = _focal_ratio_of_equivalent(tags), _focal_ratio_of_sensor(tags, width, height)
+    plausible = (ratio * math.hypot(width, height) for ratio in ratios if _MIN_FOCAL_RATIO < ratio < _MAX_FOCAL_RATIO)
+    return next(plausible, None)
+
+
+def _focal_ratio_of_equivalent(tags: dict[int, Any]) -> float:
+    """Compute the focal length over the diagonal from its 35 mm equivalent; return 0 if the tags do not state it."""
+    return _positive(tags.get(_FOCAL_LENGTH_35MM_TAG)) / _FULL_FRAME_DIAGONAL_MM
+
+
+def _focal_ratio_of_sensor(tags: dict[int, Any], width: int, height: int) -> float:
+    """Compute the focal length over the diagonal from the sensor; return 0 if the tags do not state both."""
     focal, density = _positive(tags.get(_FOCAL_LENGTH_TAG)), _positive(tags.get(_FOCAL_PLANE_X_RESOLUTION_TAG))
     unit = _MM_PER_RESOLUTION_UNIT.get(tags.get(_FOCAL_PLANE_RESOLUTION_UNIT_TAG, 2))
     if not (focal and density and unit):
-        return None
+        return 0.0
     # The density refers to the photo as it was taken, and this file may be a smaller copy.
     dimensions = _positive(tags.get(_PIXEL_X_DIMENSION_TAG)), _positive(tags.get(_PIXEL_Y_DIMENSION_TAG))
     original_side = max(dimensions) or max(width, height)
-    pixels = focal * density / unit * max(width, height) / original_side
-    return pixels if 0.1 < pixels / diagonal < 50 else None  # some cameras state the density of prints instead
+    return focal * density / unit * max(width, height) / original_side / math.hypot(width, height)
 
 
 def _positive(value: Any) -> float:

@@ -94,8 +94,23 @@ def test_the_focal_length_follows_from_the_sensor_also_in_a_shrunk_copy(tmp_path
     assert read_photo_facts(save_photo(tmp_path / "2.jpg", (1000, 750), exif=exif)).focal == pytest.approx(400)
 
 
+@pytest.mark.parametrize("equivalent", [4, 65535])
+def test_an_implausible_35_mm_equivalent_is_ignored(equivalent, tmp_path):
+    sensor = {0x920A: IFDRational(8), 0xA20E: IFDRational(2000), 0xA210: 3}  # 200 pixels a mm
+    photo = save_photo(tmp_path / "1.jpg", (4000, 3000), exif=sensor | {0xA405: equivalent})
+    assert read_photo_facts(photo).focal == pytest.approx(1600)
+
+
 @pytest.mark.parametrize(
-    "exif", [{}, {0xA405: 0}, {0x920A: IFDRational(1, 0), 0xA20E: IFDRational(72)}, {0x920A: IFDRational(8)}]
+    "exif",
+    [
+        {},
+        {0xA405: 0},
+        {0xA405: 4},
+        {0xA405: 65535},
+        {0x920A: IFDRational(1, 0), 0xA20E: IFDRational(72)},
+        {0x920A: IFDRational(8)},
+    ],
 )
 def test_without_usable_exif_there_is_no_focal_length(exif, tmp_path):
     assert read_photo_facts(save_photo(tmp_path / "1.jpg", exif=exif)).focal is None
