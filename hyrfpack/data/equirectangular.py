@@ -35,6 +35,7 @@ from hyrfpack.scene import Picture
 
 _JPEG_QUALITY = 95
 _PREVIEW_SIZE_PIXELS = (256, 128)  # width and height at which `is_panorama` examines a picture
+_MIN_EDGE_DETAIL_LEVELS = 1.0  # of 255; the detail at a panorama's edges exceeds the difference of the edges by this
 
 
 @dataclass(frozen=True)
@@ -232,7 +233,9 @@ def is_panorama(path: str | os.PathLike[str]) -> bool:
     """Return whether a picture is a panorama of the whole sphere.
 
     It is one if it is twice as wide as high, and if its XMP data or its content say so. The content fits if the left
-    edge continues the right edge, and the first and the last row, which show one point each, are nearly uniform.
+    edge continues the right edge, the first and the last row, which show one point each, are nearly uniform, and the
+    edges differ from the rest of their rows and vary from row to row. The edges of an ordinary photo with a plain
+    background continue each other too, but they do not differ and vary so.
 
     Raises:
         HyrfDataError: the file is no picture.
@@ -253,8 +256,13 @@ def is_panorama(path: str | os.PathLike[str]) -> bool:
     steps = np.abs(np.diff(rgb, axis=1)).mean(axis=(0, 2))  # mean difference of neighbouring columns
     seam = np.abs(rgb[:, 0] - rgb[:, -1]).mean()
     spread = rgb.std(axis=1).mean(axis=1)  # standard deviation of the colours in each row
+    edges = rgb[:, [0, -1]]
+    row_difference = np.abs(edges - np.median(rgb, axis=1, keepdims=True)).mean()
+    column_difference = np.abs(edges - np.median(edges, axis=0, keepdims=True)).mean()
     # A row at a pole shows only what lies within a degree of it, so its colours vary less than those of other rows.
-    return bool(seam <= 1.5 * steps.mean() and max(spread[0], spread[-1]) <= max(0.5 * spread.max(), 2.0))
+    has_uniform_poles = max(spread[0], spread[-1]) <= max(0.5 * spread.max(), 2.0)
+    has_detailed_edges = min(row_difference, column_difference) > seam + _MIN_EDGE_DETAIL_LEVELS
+    return bool(seam <= 1.5 * steps.mean() and has_uniform_poles and has_detailed_edges)
 
 
 def _source_coordinates(face: Face, size: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_up_photos import arc_pose, wall_textures
+from made_up_photos import render_panorama as render_room_panorama
 from PIL import Image
 
 from hyrfpack.data import load_scene
@@ -114,6 +116,42 @@ def test_panoramas_are_recognised_by_shape_and_content(tmp_path):
 
     assert is_panorama(tmp_path / "sky.png")
     assert not is_panorama(tmp_path / "part.png") and not is_panorama(tmp_path / "noise.png")
+
+
+def picture_of_object(width: int, background: np.ndarray) -> np.ndarray:
+    """Return a (256, 512, 3) picture of a textured object before a background (256, 512), with noise."""
+    generator = np.random.default_rng(0)
+    picture = np.repeat(background[..., None], 3, axis=2) + generator.normal(0, 2, (256, 512, 3))
+    picture[40:216, 256 - width // 2 : 256 + width // 2] = generator.uniform(0, 255, (176, width, 3))
+    return picture.clip(0, 255).astype(np.uint8)
+
+
+WALL = np.full((256, 512), 200.0)
+TABLE_BEFORE_WALL = np.where(np.arange(256)[:, None] < 150, WALL, 90.0)
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        np.full((256, 512, 3), 128, np.uint8),
+        picture_of_object(200, WALL),
+        picture_of_object(400, WALL),
+        picture_of_object(200, TABLE_BEFORE_WALL),
+        picture_of_object(200, WALL - 60 * np.linspace(-1, 1, 512) ** 2),
+        np.random.default_rng(0).normal(8, 6, (256, 512, 3)).clip(0, 255).astype(np.uint8),
+    ],
+    ids=["grey", "object", "wide object", "object on a table", "darker edges", "dark and noisy"],
+)
+def test_photos_with_plain_edges_are_not_recognised_as_panoramas(picture, tmp_path):
+    Image.fromarray(picture).save(tmp_path / "photo.png")
+    assert not is_panorama(tmp_path / "photo.png")
+
+
+def test_rendered_panoramas_of_a_room_are_recognised(tmp_path):
+    for share in (0.0, 0.5, 1.0):
+        panorama = render_room_panorama(arc_pose(share), wall_textures())
+        Image.fromarray(panorama).save(tmp_path / "room.jpg", quality=95)
+        assert is_panorama(tmp_path / "room.jpg"), share
 
 
 def test_real_photos_cropped_to_2_by_1_are_not_recognised_as_panoramas(shared_data, tmp_path):
