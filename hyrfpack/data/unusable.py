@@ -12,6 +12,8 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.outputs import RAW_PHOTO_SUFFIXES, READABLE_PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
 MAX_NAMED_FILES = 3
+INVALID_NAME_REASON = "its name is not valid UTF-8"
+_REMEDIES = {HEIC_REQUIREMENT: HEIC_REMEDY, INVALID_NAME_REASON: "rename it"}  # by the beginning of the reason
 
 
 def format_file_names(names: Sequence[str]) -> str:
@@ -74,11 +76,12 @@ def unreadable_error(given: Path, reasons: Mapping[str, str], count: int, conseq
 
 def _unreadable_problems(reasons: Mapping[str, str], count: int) -> list[tuple[str, str]]:
     """Return (problem, fix) for each remedy that unreadable photos need."""
-    heic = [name for name, reason in reasons.items() if reason.startswith(HEIC_REQUIREMENT)]
-    other = [name for name in reasons if name not in heic]
-    problems = []
-    if heic:
-        problems.append((f"{_cannot_be_read(heic, count)} ({HEIC_REQUIREMENT})", HEIC_REMEDY))
+    problems, other = [], list(reasons)
+    for known_reason, remedy in _REMEDIES.items():
+        names = [name for name in other if reasons[name].startswith(known_reason)]
+        other = [name for name in other if name not in names]
+        if names:
+            problems.append((f"{_cannot_be_read(names, count)} ({known_reason})", remedy))
     if other:
         first, it = reasons[other[0]], "it" if len(other) == 1 else "them"
         reason = first if len({reasons[name] for name in other}) == 1 else f"{other[0]}: {first}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,6 +22,7 @@ from hyrfpack.data.equirectangular import CUBE_FACES, Face, FaceFile, cut_panora
 from hyrfpack.data.folder import PhotoFacts, read_photo_facts
 from hyrfpack.data.masks import MaskMatches, check_mask_shape
 from hyrfpack.data.pictures import open_picture, read_header
+from hyrfpack.data.unusable import INVALID_NAME_REASON
 from hyrfpack.errors import HyrfDataError, short_reason, strip_path
 from hyrfpack.poses.job import Device
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
@@ -82,7 +84,8 @@ def read_headers(
         progress: called with a `TaskEvent` after each file.
 
     Returns:
-        The usable photos, sorted by name, and the reason for each photo that is left out, by its path below `root`.
+        The usable photos, sorted by name, and the reason for each photo that is left out, by its path below `root`. A
+        path that is not valid UTF-8, which pycolmap cannot store, has escapes in place of the invalid bytes.
 
     Raises:
         HyrfDataError: there is a panorama and `in_place` is set.
@@ -97,6 +100,10 @@ def read_headers(
         found = list(_report_counts(reading, progress, "reading the headers of photos", len(files)))
     for path, facts in zip(files, found, strict=True):
         source = path.relative_to(root).as_posix()
+        shown_name = os.fsencode(source).decode("utf-8", "backslashreplace")
+        if shown_name != source:
+            left_out[shown_name] = f"{INVALID_NAME_REASON}; rename it"
+            continue
         if isinstance(facts, str):
             left_out[source] = facts
             continue

@@ -15,6 +15,7 @@ import hyrfpack
 from hyrfpack.copying import copy_file
 from hyrfpack.data.folder import list_photos, read_photo_facts
 from hyrfpack.data.pictures import read_pixels
+from hyrfpack.data.unusable import unreadable_sentences
 from hyrfpack.poses.job import Device, Job
 from hyrfpack.poses.prepare import (
     Photo,
@@ -166,6 +167,21 @@ def test_duplicates_and_unreadable_files_are_omitted_with_the_reason(tmp_path):
     assert [photo.name for photo in photos] == ["a.png", "b.png"]
     assert left_out["c.png"] == "a copy of a.png"
     assert left_out["d.png"].startswith("not a picture that can be read")
+
+
+def test_photos_whose_names_are_not_utf_8_are_omitted_with_the_reason(tmp_path):
+    save_photo(tmp_path / "a.jpg", upright_picture())
+    invalid = tmp_path / os.fsdecode(b"caf\xe9.png")
+    try:
+        save_photo(invalid, upright_picture(1))
+    except OSError:
+        pytest.skip("this file system stores only names in UTF-8")
+    photos, left_out = read_photo_headers(tmp_path)
+    assert [photo.name for photo in photos] == ["a.jpg"]
+    assert left_out == {r"caf\xe9.png": "its name is not valid UTF-8; rename it"}
+    assert unreadable_sentences(left_out, 2) == [
+        r"1 of 2 photos cannot be read: caf\xe9.png (its name is not valid UTF-8); rename it"
+    ]
 
 
 def test_cameras_are_distinguished_by_folder_device_size_and_zoom(tmp_path):
