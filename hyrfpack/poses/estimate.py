@@ -15,7 +15,7 @@ from hyrfpack.config.poses import PosesConfig
 from hyrfpack.context import RunContext
 from hyrfpack.counts import format_count
 from hyrfpack.data.archive import archive_paths_in_errors, is_archive, unpack
-from hyrfpack.data.equirectangular import CUBE_FACES
+from hyrfpack.data.equirectangular import CUBE_FACES, is_panorama
 from hyrfpack.data.folder import list_photos, list_pictures, list_raw_photos
 from hyrfpack.data.masks import MaskMatches
 from hyrfpack.data.unusable import raise_if_single_photo, raw_photos_notes, unreadable_sentences
@@ -203,6 +203,12 @@ class _PoseEstimation:
             self._claim_work_folder()
             root = self._take_frames()
             source_files = list_photos(root)
+            if any(is_panorama(frame) for frame in source_files):
+                raise HyrfDataError(
+                    f"{self.given_path}: this video shows all around (360 degrees), and only pictures that do are cut "
+                    "into photos",
+                    fix="save frames of the video as pictures in a folder, and name that folder",
+                )
         copies_photos = not (in_place or is_video)
         report_photos = partial(self._report_progress, "photos")
         report_reading = part_of_progress(report_photos, 0.9 if is_video else 0.0, 0.5 if copies_photos else 1.0)

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import refused
+from made_up_photos import arc_pose, render_panorama, wall_textures
 from PIL import Image
 from scipy import ndimage
 
@@ -329,3 +331,13 @@ def test_an_omitted_frame_is_named_with_its_time(wall, tmp_path):
     job = estimation._prepare_job()
     number = int(job.names[5][6:12])
     assert estimation._user_name(job.names[5]) == f"{job.names[5]} (at {number / 30:.1f} s)"
+
+
+def test_a_360_degree_video_is_refused_by_its_own_name(tmp_path):
+    panorama = render_panorama(arc_pose(0.5), wall_textures())
+    frames = [np.roll(panorama, 4 * number, axis=1) for number in range(40)]
+    video = write_video(tmp_path / "round.mp4", frames)
+    sentence = refused("poses", video, "-o", tmp_path / "scene")
+    assert "round.mp4: this video shows all around (360 degrees)" in sentence
+    assert sentence.endswith("save frames of the video as pictures in a folder, and name that folder")
+    assert not (tmp_path / "scene").exists()
