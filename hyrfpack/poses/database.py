@@ -69,14 +69,14 @@ def make_database(job: Job) -> None:
     os.replace(unfinished, job.database)
 
 
-def verified_pairs(database: pycolmap.Database) -> Iterator[tuple[int, int, np.ndarray, str]]:
-    """Yield (first image, second image, (M, 2) matches, kind of geometry) of each geometrically verified pair."""
+def verified_pairs(database: pycolmap.Database) -> Iterator[tuple[int, int, np.ndarray]]:
+    """Yield (first image, second image, (M, 2) matches) of each geometrically verified pair."""
     pair_ids, geometries = database.read_two_view_geometries()
     for pair_id, geometry in zip(pair_ids, geometries, strict=True):
         kind = pycolmap.TwoViewGeometryConfiguration(geometry.config).name
         if len(geometry.inlier_matches) >= MIN_PAIR_MATCHES and kind not in _UNUSABLE_PAIR_KINDS:
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
-            yield first, second, np.asarray(geometry.inlier_matches), kind
+            yield first, second, np.asarray(geometry.inlier_matches)
 
 
 def read_cameras(database: pycolmap.Database) -> Cameras:
@@ -114,7 +114,7 @@ def recalibrate(job: Job, step_name: str, decide: Callable[[Cameras], Cameras], 
                 camera = cameras[int(number)]
                 camera.params, camera.has_prior_focal_length = parameters, True
                 database.update_camera(camera)
-            for first, second, _, _ in list(verified_pairs(database)):
+            for first, second, _ in list(verified_pairs(database)):
                 database.delete_two_view_geometry(first, second)
         count = count_rows(job, "matches") - count_rows(job, "two_view_geometries")
 

@@ -111,7 +111,7 @@ def _make_candidate(job: Job, name: str, pieces: list[pycolmap.Reconstruction]) 
 def _count_matches(job: Job) -> int:
     """Return the number of verified matches between all photos."""
     with open_database(job) as database:
-        return sum(len(matches) for _, _, matches, _ in verified_pairs(database))
+        return sum(len(matches) for _, _, matches in verified_pairs(database))
 
 
 def _read_ray_matches(job: Job, model: pycolmap.Reconstruction) -> list[RayMatches]:
@@ -132,7 +132,7 @@ def _read_ray_matches(job: Job, model: pycolmap.Reconstruction) -> list[RayMatch
                 rays[second][matches[:, 1]],
                 (pixel[first] + pixel[second]) / 2,
             )
-            for first, second, matches, _ in verified_pairs(database)
+            for first, second, matches in verified_pairs(database)
             if first in rays and second in rays
         ]
 

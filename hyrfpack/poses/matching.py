@@ -141,7 +141,7 @@ def _sample_strong_pairs(job: Job, database: pycolmap.Database) -> dict[int, lis
     """Return, by camera, a random sample of pairs of its photos that have many matches."""
     rng = np.random.default_rng(job.seed)
     candidates_of: dict[int, list[tuple[int, int, np.ndarray]]] = {}
-    for first, second, matches, _ in verified_pairs(database):
+    for first, second, matches in verified_pairs(database):
         device = job.device_of[first - 1] + 1
         if len(matches) >= _MIN_FOCAL_PAIR_MATCHES and job.device_of[second - 1] + 1 == device:
             candidates_of.setdefault(device, []).append((first, second, matches))
@@ -161,7 +161,7 @@ def _read_pixel_matches(database: pycolmap.Database, first: int, second: int, ma
 def _summarize_matches(job: Job) -> dict[str, Any]:
     """Return the answer of this stage, see `match_photos`."""
     with open_database(job) as database:
-        pairs = [(first, second) for first, second, _, _ in verified_pairs(database)]
+        pairs = [(first, second) for first, second, _ in verified_pairs(database)]
         cameras, strong = read_cameras(database), _sample_strong_pairs(job, database)
     turned, counted = 0.0, 0
     for number, camera_pairs in strong.items():

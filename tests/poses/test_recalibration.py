@@ -40,7 +40,7 @@ def make_job(folder: Path) -> Job:
 
 def pairs_in(job: Job) -> list[tuple[int, int]]:
     with open_database(job) as database:
-        return [(first, second) for first, second, _, _ in verified_pairs(database)]
+        return [(first, second) for first, second, _ in verified_pairs(database)]
 
 
 def test_pairs_that_failed_are_not_verified_again(tmp_path):
