@@ -118,7 +118,7 @@ def _describe_devices(name: str, self_test: bool, problems: list[str]) -> dict[s
     from hyrfpack.data.cache import memory_bytes
     from hyrfpack.device import choose_device, describe_device
     from hyrfpack.measure.machine import driver_version, processor_name
-    from hyrfpack.parallel.pool import thread_count
+    from hyrfpack.parallel.threads import thread_count
 
     gpus: list[dict[str, Any]] = []
     for number in range(torch.cuda.device_count() if torch.cuda.is_available() else 0):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from hyrfpack.parallel.pool import thread_count
+from hyrfpack.parallel.threads import thread_count
 from hyrfpack.version import __version__
 
 # Files that hold the versions of NVIDIA's and AMD's kernel modules, and the form of these versions.

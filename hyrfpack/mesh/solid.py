@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from hyrfpack.errors import HyrfError, needs_package
 from hyrfpack.mesh.clean import reduce_faces, remove_small_components
 from hyrfpack.mesh.manifold import make_manifold
-from hyrfpack.parallel.pool import thread_count
+from hyrfpack.parallel.threads import thread_count
 
 MAX_VOXELS_PER_SIDE = 160
 MIN_FUSION_VOXELS = 2.0  # side of a voxel of the solid, in voxels of the fusion

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from hyrfpack.errors import HyrfError, short_reason
 from hyrfpack.parallel.peer_watch import PeerWatch, connect_to_peers
-from hyrfpack.parallel.pool import available_cores
+from hyrfpack.parallel.threads import available_cores
 
 Item = TypeVar("Item")
 

@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.parallel.threads import thread_count
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.watch import count_rows, report_new_rows
 from hyrfpack.progress import Progress, TaskEvent
@@ -123,8 +124,12 @@ def recalibrate(job: Job, step_name: str, decide: Callable[[Cameras], Cameras], 
             doing = f"verifying pairs with refined focal lengths {min(done, count)}/{count}"
             report_progress(TaskEvent(doing, 0.5 + 0.5 * share))
 
+        verifier_options = pycolmap.GeometricVerifierOptions()
+        verifier_options.num_threads = thread_count()
         with report_new_rows(job, "two_view_geometries", report_done):
-            pycolmap.geometric_verification(job.database, two_view_geometry_options=verification_options(job.seed))
+            pycolmap.geometric_verification(
+                job.database, verifier_options, two_view_geometry_options=verification_options(job.seed)
+            )
         done.touch()
     return bool(decisions)
 

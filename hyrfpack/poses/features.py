@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -18,6 +17,7 @@ from hyrfpack.atomic import write_atomic
 from hyrfpack.data.pictures import read_mask, read_pixels
 from hyrfpack.data.quality import measure_sharpness
 from hyrfpack.errors import HyrfDataError, strip_path
+from hyrfpack.parallel.threads import thread_count
 from hyrfpack.poses.database import make_database, open_database
 from hyrfpack.poses.job import Job, chunks
 from hyrfpack.poses.watch import report_new_rows
@@ -60,7 +60,7 @@ def find_features(job: Job, report_progress: Progress) -> dict[str, Any]:
             report_done(done)
             folder = job.work / "working"
             shutil.rmtree(folder, ignore_errors=True)
-            with ThreadPoolExecutor(os.cpu_count()) as pool:
+            with ThreadPoolExecutor(thread_count()) as pool:
                 write_copy = partial(_write_working_copy, job, folder, device.working_size)
                 copies = list(pool.map(write_copy, names, [numbers[name] for name in names]))
             for name, (sharp, reason) in zip(names, copies, strict=True):
@@ -109,6 +109,7 @@ def _extract_features(job: Job, folder: Path, numbers: list[int], camera: int) -
     if not numbers:
         return
     options = pycolmap.FeatureExtractionOptions()
+    options.num_threads = thread_count()
     options.sift.max_num_features = _MAX_FEATURES_PER_PHOTO
     options.sift.first_octave = -1 if max(job.devices[camera - 1].working_size) <= _MAX_UPSAMPLED_SIDE_PIXELS else 0
     reader = pycolmap.ImageReaderOptions()

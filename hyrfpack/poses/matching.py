@@ -9,6 +9,7 @@ import numpy as np
 import pycolmap
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.parallel.threads import thread_count
 from hyrfpack.poses import pairs as pairing
 from hyrfpack.poses.calibrate import (
     CANDIDATE_FOCAL_RATIOS,
@@ -106,10 +107,10 @@ def _match_pairs(job: Job, pairs: pairing.Pairs, report_progress: Progress) -> N
         list_path.write_text("".join(lines), encoding="utf-8")
         options = pycolmap.ImportedPairingOptions()
         options.match_list_path, options.block_size = list_path, _MAX_CACHED_PHOTOS
+        matching_options = pycolmap.FeatureMatchingOptions()
+        matching_options.num_threads = thread_count()
         with report_new_rows(job, "two_view_geometries", report_new):
-            pycolmap.match_image_pairs(
-                job.database, pairing_options=options, verification_options=verification_options(job.seed)
-            )
+            pycolmap.match_image_pairs(job.database, matching_options, options, verification_options(job.seed))
         list_path.unlink()
 
 

@@ -24,6 +24,7 @@ from hyrfpack.data.masks import MaskMatches, check_mask_shape
 from hyrfpack.data.pictures import open_picture, read_header
 from hyrfpack.data.unusable import INVALID_NAME_REASON
 from hyrfpack.errors import HyrfDataError, short_reason, strip_path
+from hyrfpack.parallel.threads import thread_count
 from hyrfpack.poses.job import Device
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 
@@ -95,7 +96,7 @@ def read_headers(
     taken = {path.relative_to(root).as_posix() for path in files}  # names that faces and rewritten photos must not get
     first_with: dict[tuple[int, str], str] = {}
     sizes = Counter(path.stat().st_size for path in files)
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         reading = pool.map(_read_facts_or_reason, files)
         found = list(_report_counts(reading, progress, "reading the headers of photos", len(files)))
     for path, facts in zip(files, found, strict=True):
@@ -195,7 +196,7 @@ def make_images(photos: Sequence[Photo], folder: Path, progress: Progress = igno
     for parent in {(folder / photo.name).parent for photo in photos}:
         parent.mkdir(parents=True, exist_ok=True)
     whole = [photo for photo in photos if photo.face is None]
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         writing = pool.map(lambda photo: _write_photo(photo, folder / photo.name), whole)
         list(_report_counts(writing, progress, _COPYING_TASK, len(photos)))
     panoramas = {photo.facts.path: (folder / photo.name).parent for photo in photos if photo.face}

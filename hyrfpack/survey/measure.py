@@ -13,7 +13,7 @@ from hyrfpack.data.archive import display_path
 from hyrfpack.data.folder import PhotoFacts, read_photo_facts
 from hyrfpack.data.quality import Exposure, measure_exposure, measure_sharpness, read_gray
 from hyrfpack.errors import HyrfDataError, strip_path
-from hyrfpack.parallel.pool import thread_count
+from hyrfpack.parallel.threads import thread_count
 from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.scene import evenly_spaced
 

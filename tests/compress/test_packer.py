@@ -24,7 +24,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format import describe_file, load_model, save_model
 from hyrfpack.format.codec import load_with_provenance
-from hyrfpack.parallel.pool import thread_count
+from hyrfpack.parallel.threads import thread_count
 from hyrfpack.render import render_view
 from hyrfpack.scene import Scene
 from tools.safety.train_golden import DEMO_COMPACT_FILE, DEMO_MODEL_FILE

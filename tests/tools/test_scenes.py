@@ -12,7 +12,7 @@ import pytest
 
 import hyrfpack
 from hyrfpack.errors import HyrfError
-from hyrfpack.parallel.pool import thread_count
+from hyrfpack.parallel.threads import thread_count
 from hyrfpack.scene import Camera
 from tools.scenes import write_set as command
 from tools.scenes.catalog import LAYOUTS, SceneDescription, make_scene

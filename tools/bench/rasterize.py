@@ -19,7 +19,7 @@ from hyrfpack.bench.operation_calls import random_cotangent, rasterize_call
 from hyrfpack.measure.error import largest_error, measure_error, measure_relative_error
 from hyrfpack.ops.rasterize import INPUT_SHAPES, Gaussians3D, rasterize
 from hyrfpack.ops.viewport import Viewport
-from hyrfpack.parallel.pool import thread_count
+from hyrfpack.parallel.threads import thread_count
 
 # Number of Gaussians, width and height in pixels, and standard deviation of a Gaussian in pixels.
 WORKLOAD_SIZES = {"A": (50_000, 320, 240, 1.75), "B": (200_000, 800, 800, 2.6)}

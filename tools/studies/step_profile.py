@@ -63,7 +63,8 @@ from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, cpu, rasterize
 from hyrfpack.ops.rasterize.cpu_bin import SLOT_SHIFT_BITS
 from hyrfpack.ops.rasterize.reference import TILE_SIZE
 from hyrfpack.ops.ssim import photometric_loss
-from hyrfpack.parallel.pool import run_tasks, thread_count, torch_on_one_thread
+from hyrfpack.parallel.pool import run_tasks, torch_on_one_thread
+from hyrfpack.parallel.threads import thread_count
 from hyrfpack.progress import StepEvent
 from hyrfpack.render import Rendering, render_view
 from hyrfpack.scene import Camera, Scene

@@ -15,7 +15,8 @@ from hyrfpack.ops.rasterize.cpu_project import GaussianArrays, Projection, Proje
 from hyrfpack.ops.rasterize.inputs import Gaussians3D, RasterSettings
 from hyrfpack.ops.rasterize.reference import TILE_SIZE, jacobian_limits
 from hyrfpack.ops.viewport import Viewport
-from hyrfpack.parallel.pool import run_ranges, run_tasks, thread_count
+from hyrfpack.parallel.pool import run_ranges, run_tasks
+from hyrfpack.parallel.threads import thread_count
 
 # A thread blends about this many pairs in the time that another one takes to start. Shorter runs would not pay off.
 _MIN_PAIRS_PER_RUN = 128
