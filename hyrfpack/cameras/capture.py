@@ -29,6 +29,7 @@ FALLBACK_ORBIT_CAMERAS = 48
 COARSE_POSE_STEPS_PER_SCENE_SCALE = 500
 
 # A stored camera matches a photo's camera that differs from it by no more than these two limits.
+MISMATCH_REMEDY = "name the photos and poses that it was trained on"
 _MAX_MATCH_DISTANCE_SCENE_SCALES = 5 / COARSE_POSE_STEPS_PER_SCENE_SCALE
 _MAX_MATCH_ANGLE_DEGREES = 3.0
 # With a lower share of matched cameras, the photos are not those of training. The share is above zero because two
@@ -177,10 +178,10 @@ class Capture:
 
     @property
     def mismatch(self) -> str:
-        """A warning if the cameras of the scene differ from those stored in the file, otherwise "".
+        """The problem if the cameras of the scene differ from those stored in the file, otherwise "".
 
         They differ if the photos show another scene, or if their poses are in another coordinate frame. Without a
-        scene or without stored cameras there is no warning. Names of photos are not compared: files do not store them,
+        scene or without stored cameras there is none. Names of photos are not compared: files do not store them,
         and photos keep their names when their poses are estimated again.
         """
         if self.scene is None:
@@ -209,7 +210,7 @@ class Capture:
         return (
             f"{self.scene.path}: of the {len(kept)} cameras that the model keeps of its training, {found or 'none'} "
             f"{'are' if found > 1 else 'is'} among those of these photos, which may show another scene or have poses "
-            "in another coordinate frame; name the photos and poses that it was trained on"
+            "in another coordinate frame"
         )
 
     @property

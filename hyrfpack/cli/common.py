@@ -16,7 +16,7 @@ from hyrfpack.choices import LAYOUTS
 from hyrfpack.cli.console import note, note_if_verbose
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.config.train import TrainConfig
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfDataError, HyrfError
 
 if TYPE_CHECKING:
     import torch
@@ -155,7 +155,9 @@ def choose_command_device(name: str, ranks: Ranks | None = None) -> torch.device
     return device
 
 
-def read_scene(path: Path, reader_options: dict[str, Any], model: dict | None = None) -> Scene:
+def read_scene(
+    path: Path, reader_options: dict[str, Any], model: dict | None = None, *, must_match: bool = False
+) -> Scene:
     """Read a folder of photos and poses, and print the reader's notes.
 
     A further note says whether a model was trained on other photos.
@@ -165,11 +167,12 @@ def read_scene(path: Path, reader_options: dict[str, Any], model: dict | None = 
         reader_options: values of the options of `scene_options`.
         model: description (`hyrfpack.describe_file`) of the model file that belongs to the photos, if any. It gives the
             size of the photos if --max-size does not.
+        must_match: refuse photos that the model was not trained on, because what is written depends on them.
 
     Raises:
-        HyrfError: as `hyrfpack.load_scene`.
+        HyrfError: as `hyrfpack.load_scene`, or the photos do not match the model.
     """
-    from hyrfpack.cameras.capture import Capture
+    from hyrfpack.cameras.capture import MISMATCH_REMEDY, Capture
     from hyrfpack.data import load_scene
     from hyrfpack.scene import DEFAULT_MAX_SIZE
 
@@ -179,7 +182,9 @@ def read_scene(path: Path, reader_options: dict[str, Any], model: dict | None = 
     for sentence in scene.notes:
         note(sentence)
     if model is not None and (mismatch := Capture(model, scene).mismatch):
-        note(mismatch)
+        if must_match:
+            raise HyrfDataError(mismatch, fix=MISMATCH_REMEDY)
+        note(f"{mismatch}; {MISMATCH_REMEDY}")
     return scene
 
 

@@ -250,7 +250,7 @@ def edit(
     from hyrfpack.format import describe_file
 
     model = resolve_model_file(model)
-    scene = None if data is None else read_scene(data, reader_options, describe_file(model))
+    scene = None if data is None else read_scene(data, reader_options, describe_file(model), must_match=True)
     if plan:
         report = plan_edit(model, actions, part=part, data=scene, picture=picture, overwrite=overwrite)
     else:

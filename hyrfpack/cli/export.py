@@ -136,7 +136,10 @@ def export(
             fix="give it once for each model, or not at all",
         )
     check_request(kind, output, config)
-    scenes = [read_scene(path, reader_options, describe_file(model)) for path, model in zip(data, files, strict=False)]
+    scenes = [
+        read_scene(path, reader_options, describe_file(model), must_match=True)
+        for path, model in zip(data, files, strict=False)
+    ]
     if kind is PLAYER_FOLDER:
         check_folder(output, models, scenes, overwrite=overwrite, is_gallery=len(models) > 1)
     else:

@@ -139,6 +139,8 @@ def render(
         cameras_around = orbit_around(source.viewpoint, orbit or DEFAULT_ORBIT_FRAMES)
         named = [(f"{number:04d}", camera) for number, camera in enumerate(cameras_around)]
     video_path = output / "video.mp4" if video and has_ffmpeg() else None
+    if video and not video_path:
+        note("ffmpeg was not found, so only pictures are written; install the ffmpeg program for a video")
     names = render_file_names([name for name, _ in named], geometry)
     names += [video_path.name] if video_path else []
     names += [CAMERAS_NAME] if writer else []
@@ -186,8 +188,6 @@ def render(
         )
     for name, path in zip(render_file_names([name for name, _ in named]), written, strict=True):
         note_rename(output / name, path)
-    if video and not video_path:
-        note("ffmpeg was not found, so no video was written; the pictures are complete")
     if as_json:
         print_json({"pictures": [str(path) for path in written], "video": str(video_path) if video_path else None})
     else:

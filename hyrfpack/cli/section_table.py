@@ -23,6 +23,9 @@ def format_section_table(
     rest = SectionSize("", "header, table of contents, padding", 0, total - sum(part.after for part in parts))
     header = ["section", "unpacked bytes", "stored bytes", "share", "bits/Gaussian", "bits/number"]
     rows = []
+    stored = {part.type for part in parts}
+    if stored.isdisjoint(shares or ()):  # each part of a merged file has sections of its own, which are not listed
+        shares = None
     for part in (*parts, rest):
         row = [
             f"{part.type} {part.holds}".strip(),
@@ -35,7 +38,6 @@ def format_section_table(
         rows.append([*row, f"{shares[part.type]:.1%}" if part.type in shares else ""] if shares else row)
     if shares:
         header.append("of the loss")
-        stored = {part.type for part in parts}
         left_out = sum(share for part, share in shares.items() if part not in stored)
         rows.append(["Gaussians left out", "", "", "", "", "", f"{left_out:.1%}"])
     return format_table(header, rows)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from hyrfpack.checks import check_float, check_int
+from hyrfpack.checks import check_float, check_int, check_positive
 from hyrfpack.config.settings import Range, check_settings
 from hyrfpack.counts import format_count
 
@@ -75,9 +75,7 @@ class CropSphere:
 
     def __post_init__(self) -> None:
         _check_vector("center", self.center)
-        check_float("radius", self.radius)
-        if self.radius == 0:
-            raise ValueError("radius is 0; it must be above 0")
+        check_positive("radius", self.radius)
 
     def __str__(self) -> str:
         return f"crop to the sphere of radius {self.radius:g} around {_format(self.center)}"
@@ -319,9 +317,7 @@ class Scale:
     factor: float
 
     def __post_init__(self) -> None:
-        check_float("factor", self.factor)
-        if self.factor == 0:
-            raise ValueError("factor is 0; it must be above 0")
+        check_positive("factor", self.factor)
 
     def __str__(self) -> str:
         return f"scale by {self.factor:g}"

@@ -235,7 +235,7 @@ def test_a_video_without_ffmpeg_gives_pictures_and_a_note(packed, tmp_path, monk
     monkeypatch.setenv("PATH", str(tmp_path))
     result = succeeded("render", packed, "-o", tmp_path / "out", "--orbit", 2, "--video", "--json")
     assert json.loads(result.stdout)["video"] is None
-    assert "ffmpeg was not found, so no video was written" in result.stderr
+    assert "ffmpeg was not found, so only pictures are written" in result.stderr
     assert len(list((tmp_path / "out").iterdir())) == 2
 
 

@@ -22,9 +22,10 @@ from explicit_balls import ball_splats
 from exposures import random_map
 from scenes import ring, small_model
 
-from hyrfpack.cameras.capture import provenance_cameras
+from hyrfpack.cameras.capture import provenance_cameras, scene_provenance
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.cli import main
+from hyrfpack.data import load_scene
 from hyrfpack.format import save_model
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.formats import ply
@@ -41,6 +42,15 @@ def model(tmp_path_factory):
     path, cameras = tmp_path_factory.mktemp("models") / "model.hyrf", ring(4)
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
     save_model(small_model(GAUSSIAN_POSITIONS, fields=2.0, background=True), path, provenance=kept)
+    return path
+
+
+@pytest.fixture
+def photographed_model(data, tmp_path):
+    """The same Gaussians, with the cameras of the photos of `data`."""
+    path = tmp_path / "photographed.hyrf"
+    trained_on = scene_provenance(load_scene(data))
+    save_model(small_model(GAUSSIAN_POSITIONS, fields=2.0, background=True), path, provenance=trained_on)
     return path
 
 
@@ -73,8 +83,18 @@ def test_identical_pictures_are_json_too(tmp_path):
     assert report["psnr"] == report["psnr_baked"] == report["chosen_by"]["3"] == 100
 
 
-def test_given_photos_are_scored(model, data, tmp_path):
-    arguments = ("export", model, "-o", tmp_path / "a.ply", "--overwrite", "--sh-degree", 0, "--data", data)
+def test_given_photos_are_scored(photographed_model, data, tmp_path):
+    arguments = (
+        "export",
+        photographed_model,
+        "-o",
+        tmp_path / "a.ply",
+        "--overwrite",
+        "--sh-degree",
+        0,
+        "--data",
+        data,
+    )
     last = succeeded(*arguments).stdout.splitlines()[-1]
     form = r"PSNR against held-out photos: model \d+\.\d{3} dB, file \d+\.\d{3} dB"
     assert re.fullmatch(form, last)
@@ -82,10 +102,9 @@ def test_given_photos_are_scored(model, data, tmp_path):
 
 
 def test_both_exposures_are_printed_and_the_one_in_the_file_is_marked(data, tmp_path):
-    mapped, cameras = small_model(GAUSSIAN_POSITIONS), ring(4)
+    mapped = small_model(GAUSSIAN_POSITIONS)
     mapped.exposure = random_map(0, centers=4)
-    kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    save_model(mapped, tmp_path / "mapped.hyrf", provenance=kept)
+    save_model(mapped, tmp_path / "mapped.hyrf", provenance=scene_provenance(load_scene(data)))
     arguments = ("export", tmp_path / "mapped.hyrf", "-o", tmp_path / "a.ply", "--overwrite", "--sh-degree", 1)
     printed = succeeded(*arguments, "--exposure", "consistent").stdout
     report = json.loads(succeeded(*arguments, "--json").stdout)
@@ -144,7 +163,7 @@ def test_a_page_embeds_the_model_unless_it_is_baked(model, tmp_path):
     assert "is copied unchanged" in result.stderr
 
 
-def test_folders_are_players_and_galleries(model, data, tmp_path):
+def test_folders_are_players_and_galleries(model, photographed_model, data, tmp_path):
     succeeded("export", "-o", tmp_path / "empty")
     succeeded("export", model, "-o", tmp_path / "player")
     report = json.loads(succeeded("export", model, model, "-o", tmp_path / "gallery", "--json").stdout)
@@ -153,7 +172,7 @@ def test_folders_are_players_and_galleries(model, data, tmp_path):
     assert not (tmp_path / "empty" / "scene.hyrf").exists()
     assert {path.name for path in (tmp_path / "gallery").iterdir()} >= {"player.html", "model.hyrf", "model-2.hyrf"}
     options = ("-o", tmp_path / "scored", "--data", data, "--data", data)
-    succeeded("export", model, model, *options)
+    succeeded("export", photographed_model, photographed_model, *options)
     assert (tmp_path / "scored" / "index.html").read_text().count(" dB on ") == 2
     assert "--overwrite" in refused("export", model, "-o", tmp_path / "player")
     succeeded("export", model, "-o", tmp_path / "player", "--overwrite")

@@ -1,4 +1,4 @@
-"""`evaluate` and `render --data` report photos that a model was not trained on, and continue."""
+"""Photos that a model was not trained on: scored and rendered with a note, refused where the output depends on them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from commands import succeeded
+from commands import refused, succeeded
 from scenes import small_model
 
 import hyrfpack
@@ -51,3 +51,20 @@ def test_render_notes_poses_in_another_frame_and_renders(model, data, data_in_an
         == 1
     )
     assert len(list((tmp_path / "b").iterdir())) == 2
+
+
+@pytest.mark.parametrize(
+    ("command", "output"),
+    [
+        ("compress", "small.hyrf"),
+        ("edit --crop-sphere 0,0,0,1 --max-psnr-drop 1", "edited.hyrf"),
+        ("export", "model.ply"),
+        ("split", "chunks"),
+    ],
+)
+def test_commands_that_fit_or_choose_by_photos_refuse_other_ones(
+    model, data_in_another_frame, tmp_path, command, output
+):
+    name, *options = command.split()
+    message = refused(name, model, "-o", tmp_path / output, *options, "--data", data_in_another_frame)
+    assert MISMATCH_NOTE in message and not (tmp_path / output).exists()

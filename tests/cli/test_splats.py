@@ -15,9 +15,9 @@ from explicit_balls import ball_splats
 from PIL import Image
 from scenes import ring, small_model
 
-from hyrfpack.cameras.capture import provenance_cameras
+from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.cameras.files import cameras_to_json
-from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.data import load_scene
 from hyrfpack.format import save_model
 from hyrfpack.splats.files import READABLE_ENDINGS
 from hyrfpack.splats.formats import sog
@@ -102,10 +102,9 @@ def test_depth_and_normals_of_splats_are_in_world_units_and_axes(tmp_path):
 
 
 def test_an_exported_file_has_the_score_that_the_export_printed(data, tmp_path):
-    cameras = ring(4)
     positions = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
-    kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    save_model(small_model(positions, fields=2.0, background=True), tmp_path / "model.hyrf", provenance=kept)
+    trained_on = scene_provenance(load_scene(data))
+    save_model(small_model(positions, fields=2.0, background=True), tmp_path / "model.hyrf", provenance=trained_on)
     export = ("export", tmp_path / "model.hyrf", "-o", tmp_path / "a.ply", "--data", data, "--sh-degree", 1, "--json")
     messages = json.loads(succeeded(*export).stdout)
     scored = {

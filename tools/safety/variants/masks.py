@@ -34,7 +34,7 @@ def variants() -> Iterator[Variant]:
     yield Variant(
         "masks: of no photo",
         lambda s: (s.write_masks(lambda f: f"masks/{f.stem}_mask.png"), setattr(s, "masked", 0.0)),
-        note="match no posed photo",
+        note="match no photo of the scene",
     )
     yield Variant(
         "masks: in mask/",
