@@ -86,7 +86,7 @@ def import_splats(
     The arguments are those of `import_loaded_splats`; `read_splats` describes which files can be read.
 
     Raises:
-        HyrfDataError: the source cannot be read, or no view shows any of its Gaussians.
+        HyrfDataError: the source cannot be read, or the viewpoints show none or less than 1 % of its Gaussians.
         HyrfSizeError: no file of this scene is as small as `config.target_bytes`.
         HyrfError: no file at all is that small, or the target cannot be written.
         TypeError: the settings or a camera have the wrong type.
@@ -150,7 +150,7 @@ def import_loaded_splats(
         context: device for rendering, progress and stop.
 
     Raises:
-        HyrfDataError: no view shows any of the splats.
+        HyrfDataError: the viewpoints show none or less than 1 % of the splats.
         HyrfSizeError: no file of this scene is as small as `config.target_bytes`.
         HyrfError: no file at all is that small, the file cannot be written, or the device does not exist.
     """

@@ -105,6 +105,17 @@ def test_splats_that_cannot_be_seen_are_a_clear_error(tmp_path: Path, change) ->
         import_loaded_splats(change(ball_splats(20)), tmp_path / "x.hyrf", TINY_IMPORT_CONFIG, name="ball.ply")
 
 
+def test_cameras_of_another_scene_are_a_clear_error(tmp_path: Path) -> None:
+    splats = ball_splats(301)
+    far = replace(splats, positions=splats.positions + np.where(np.arange(301) < 300, 1000.0, 0.0)[:, None])
+    pose = np.eye(4)
+    pose[2, 3] = 3
+    with pytest.raises(HyrfDataError, match="show only 1 of 301 Gaussians, as if they belonged to another scene"):
+        import_loaded_splats(
+            far, tmp_path / "x.hyrf", TINY_IMPORT_CONFIG, cameras=[Camera(32, 32, 32, 32, 16, 16, pose)]
+        )
+
+
 def test_cameras_that_see_no_splats_are_a_clear_error(tmp_path: Path) -> None:
     pose = np.eye(4)
     pose[2, 3] = -100  # moves all splats behind the camera
