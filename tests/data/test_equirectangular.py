@@ -126,18 +126,18 @@ def picture_of_object(width: int, background: np.ndarray) -> np.ndarray:
     return picture.clip(0, 255).astype(np.uint8)
 
 
-WALL = np.full((256, 512), 200.0)
-TABLE_BEFORE_WALL = np.where(np.arange(256)[:, None] < 150, WALL, 90.0)
+PLAIN_WALL = np.full((256, 512), 200.0)
+TABLE_BEFORE_WALL = np.where(np.arange(256)[:, None] < 150, PLAIN_WALL, 90.0)
 
 
 @pytest.mark.parametrize(
     "picture",
     [
         np.full((256, 512, 3), 128, np.uint8),
-        picture_of_object(200, WALL),
-        picture_of_object(400, WALL),
+        picture_of_object(200, PLAIN_WALL),
+        picture_of_object(400, PLAIN_WALL),
         picture_of_object(200, TABLE_BEFORE_WALL),
-        picture_of_object(200, WALL - 60 * np.linspace(-1, 1, 512) ** 2),
+        picture_of_object(200, PLAIN_WALL - 60 * np.linspace(-1, 1, 512) ** 2),
         np.random.default_rng(0).normal(8, 6, (256, 512, 3)).clip(0, 255).astype(np.uint8),
     ],
     ids=["grey", "object", "wide object", "object on a table", "darker edges", "dark and noisy"],

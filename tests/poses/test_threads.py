@@ -18,13 +18,13 @@ from hyrfpack.progress import ignore_progress
 
 pycolmap = pytest.importorskip("pycolmap")
 
-THREADS = 3
+THREAD_COUNT = 3
 
 
 @pytest.fixture
 def recorded_threads(monkeypatch) -> dict[str, set[int | None]]:
     """Set HYRFPACK_THREADS, and record the threads of each pool and of each function of pycolmap that has many."""
-    monkeypatch.setenv("HYRFPACK_THREADS", str(THREADS))
+    monkeypatch.setenv("HYRFPACK_THREADS", str(THREAD_COUNT))
     found: dict[str, set[int | None]] = {}
 
     def record(name: str, options_type: type) -> None:
@@ -60,5 +60,5 @@ def test_the_number_of_threads_is_that_of_the_environment(recorded_threads, tmp_
     match_photos(job, ignore_progress)
     recalibrate(job, "step", lambda cameras: cameras, ignore_progress)
     assert recorded_threads == {
-        name: {THREADS} for name in ("pools", "extract_features", "match_image_pairs", "geometric_verification")
+        name: {THREAD_COUNT} for name in ("pools", "extract_features", "match_image_pairs", "geometric_verification")
     }
