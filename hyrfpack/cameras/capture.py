@@ -28,8 +28,8 @@ MIN_COARSE_CAMERAS = 14
 FALLBACK_ORBIT_CAMERAS = 48
 COARSE_POSE_STEPS_PER_SCENE_SCALE = 500
 
-# A stored camera matches a photo's camera that differs from it by no more than these two limits.
 MISMATCH_REMEDY = "name the photos and poses that it was trained on"
+# A stored camera matches a photo's camera that differs from it by no more than these two limits.
 _MAX_MATCH_DISTANCE_SCENE_SCALES = 5 / COARSE_POSE_STEPS_PER_SCENE_SCALE
 _MAX_MATCH_ANGLE_DEGREES = 3.0
 # With a lower share of matched cameras, the photos are not those of training. The share is above zero because two

@@ -13,7 +13,7 @@ from hyrfpack.outputs import RAW_PHOTO_SUFFIXES, READABLE_PICTURE_SUFFIXES, VIDE
 
 MAX_NAMED_FILES = 3
 INVALID_NAME_REASON = "its name is not valid UTF-8"
-_REMEDIES = {HEIC_REQUIREMENT: HEIC_REMEDY, INVALID_NAME_REASON: "rename it"}  # by the beginning of the reason
+_REMEDY_BY_REASON_PREFIX = {HEIC_REQUIREMENT: HEIC_REMEDY, INVALID_NAME_REASON: "rename it"}
 
 
 def format_file_names(names: Sequence[str]) -> str:
@@ -77,7 +77,7 @@ def unreadable_error(given: Path, reasons: Mapping[str, str], count: int, conseq
 def _unreadable_problems(reasons: Mapping[str, str], count: int) -> list[tuple[str, str]]:
     """Return (problem, fix) for each remedy that unreadable photos need."""
     problems, other = [], list(reasons)
-    for known_reason, remedy in _REMEDIES.items():
+    for known_reason, remedy in _REMEDY_BY_REASON_PREFIX.items():
         names = [name for name in other if reasons[name].startswith(known_reason)]
         other = [name for name in other if name not in names]
         if names:

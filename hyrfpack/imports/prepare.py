@@ -32,7 +32,7 @@ LIGHT_MEASUREMENT_VIEWS = 64
 # The faintest Gaussians that together send less than this share of all light are left out. Compression prunes others
 # as the target PSNR allows.
 FAINT_LIGHT_SHARE = 1e-4
-MIN_SHOWN_SHARE = 0.01  # Given cameras that show fewer of the Gaussians belong to another scene.
+MIN_SHOWN_GAUSSIANS_SHARE = 0.01  # Given cameras that show fewer of the Gaussians belong to another scene.
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def prepare_model(
     kept = torch.from_numpy(_indices_without_faint(light.cpu().numpy())).to(device)
     if not len(kept):
         raise HyrfDataError(f"{name}: no view shows anything of the Gaussians", fix="give others with `cameras`")
-    if cameras is not None and len(kept) < MIN_SHOWN_SHARE * len(splats):
+    if cameras is not None and len(kept) < MIN_SHOWN_GAUSSIANS_SHARE * len(splats):
         raise HyrfDataError(
             f"{name}: the given viewpoints show only {len(kept):,} of {format_count(len(splats), 'Gaussian')}, as if "
             "they belonged to another scene",
