@@ -25,7 +25,7 @@ from hyrfpack.cli.common import (
 from hyrfpack.cli.processes import processes_option
 from hyrfpack.cli.section_table import format_section_table
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import INPUT_PATH, OUTPUT, reject_non_finite
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT, OUTPUT_FOLDER, reject_non_finite
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.counts import format_count
 from hyrfpack.outputs import Outputs
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 @settings_options(CompressConfig, "finetune_steps", "prune", "target_bytes", "max_psnr_drop")
 @click.option(
     "--report",
-    type=OUTPUT,
+    type=OUTPUT_FOLDER,
     metavar="DIR",
     help="Write a page to this folder: rate and distortion, renders, error maps.",
 )

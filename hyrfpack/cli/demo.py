@@ -9,14 +9,20 @@ import click
 from hyrfpack.cli.common import json_option, note_rename, overwrite_option, print_json
 from hyrfpack.cli.console import notes_only_of
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import OUTPUT
+from hyrfpack.cli.types import OUTPUT_FOLDER
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.outputs import Outputs
 
 
 @click.command(short_help="Run every stage on a small synthetic scene.")
 @click.option(
-    "-o", "--output", type=OUTPUT, default=Path("demo"), show_default=True, metavar="DIR", help="Folder of the results."
+    "-o",
+    "--output",
+    type=OUTPUT_FOLDER,
+    default=Path("demo"),
+    show_default=True,
+    metavar="DIR",
+    help="Folder of the results.",
 )
 @settings_options(TrainConfig, "steps")
 @overwrite_option

@@ -11,7 +11,7 @@ from hyrfpack.choices import AS_PHOTOGRAPHED
 from hyrfpack.cli.common import format_consistent_psnr, format_table, note, print_json, read_scene, scene_options
 from hyrfpack.cli.drawing import drawing_options, largest_picture_size, select_views, split_option
 from hyrfpack.cli.progress import show_progress
-from hyrfpack.cli.types import INPUT_PATH, OUTPUT
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT_FOLDER
 from hyrfpack.counts import format_count
 from hyrfpack.outputs import Outputs
 
@@ -33,7 +33,10 @@ if TYPE_CHECKING:
     "--lpips-weights", type=INPUT_PATH, metavar="FILE", help="Weights of the lpips package, needed for LPIPS."
 )
 @click.option(
-    "--pictures", type=OUTPUT, metavar="DIR", help="Write a picture of each photo, its render and the error to DIR."
+    "--pictures",
+    type=OUTPUT_FOLDER,
+    metavar="DIR",
+    help="Write a picture of each photo, its render and the error to DIR.",
 )
 @drawing_options
 def evaluate(

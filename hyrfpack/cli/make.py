@@ -20,7 +20,7 @@ from hyrfpack.cli.common import (
 from hyrfpack.cli.console import notes_only_of
 from hyrfpack.cli.live import serve_training_view, view_options
 from hyrfpack.cli.settings import reject_two_sizes, settings_options
-from hyrfpack.cli.types import INPUT_PATH, OUTPUT
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT, OUTPUT_FOLDER
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.counts import format_count
 
@@ -37,7 +37,10 @@ MAX_LISTED_PHOTOS = 5
 @settings_options(MakeConfig, "quality", "minutes", "target_bytes", "max_gaussians", "preset", "matching")
 @settings_options(MakeConfig, "images", "max_size", "test_every")
 @click.option(
-    "--work", type=OUTPUT, metavar="DIR", help="Folder of intermediate results.  [default: the name of FILE with .work]"
+    "--work",
+    type=OUTPUT_FOLDER,
+    metavar="DIR",
+    help="Folder of intermediate results.  [default: the name of FILE with .work]",
 )
 @device_option
 @settings_options(MakeConfig, "seed")

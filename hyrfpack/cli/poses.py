@@ -11,7 +11,7 @@ import click
 
 from hyrfpack.cli.common import json_option, note, note_if_verbose, print_json
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import INPUT_PATH, OUTPUT
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT_FOLDER
 from hyrfpack.config.poses import PosesConfig
 from hyrfpack.counts import format_count
 
@@ -24,7 +24,7 @@ _MAX_NAMED_PHOTOS = 5
 
 @click.command(short_help="Estimate the camera poses of photos or a video.")
 @click.argument("photos", type=INPUT_PATH)
-@click.option("-o", "--output", "out", type=OUTPUT, required=True, metavar="SCENE", help="Folder of the scene.")
+@click.option("-o", "--output", "out", type=OUTPUT_FOLDER, required=True, metavar="SCENE", help="Folder of the scene.")
 @settings_options(PosesConfig, "matching")
 @click.option(
     "--masks", type=INPUT_PATH, metavar="FOLDER", help="Masks, named like the photos; black pixels are ignored."

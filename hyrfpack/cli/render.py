@@ -14,7 +14,7 @@ from hyrfpack.cli.common import note, note_rename, print_json, read_scene, scene
 from hyrfpack.cli.drawing import drawing_options, largest_picture_size, select_views, split_option
 from hyrfpack.cli.progress import show_item_progress
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import INPUT_PATH, OUTPUT, SIZE
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT_FOLDER, SIZE
 from hyrfpack.config.render import DEFAULT_DEPTH_UNIT, GeometryConfig
 from hyrfpack.counts import format_count
 from hyrfpack.outputs import Outputs
@@ -32,7 +32,7 @@ CAMERAS_NAME = "cameras.json"
 
 @click.command(short_help="Render views to picture files.")
 @click.argument("model", type=INPUT_PATH)
-@click.option("-o", "--output", type=OUTPUT, required=True, metavar="OUT", help="Folder of the pictures.")
+@click.option("-o", "--output", type=OUTPUT_FOLDER, required=True, metavar="OUT", help="Folder of the pictures.")
 @click.option("--data", type=INPUT_PATH, help="Render the views of this folder of photos and poses.")
 @split_option("Views of --data to render.")
 @scene_options

@@ -17,14 +17,14 @@ from hyrfpack.cli.common import (
     scene_options,
 )
 from hyrfpack.cli.settings import settings_options
-from hyrfpack.cli.types import INPUT_PATH, OUTPUT
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT_FOLDER
 from hyrfpack.config.split import SplitConfig
 from hyrfpack.counts import format_count
 
 
 @click.command(short_help="Split a model into chunks with levels of detail.")
 @click.argument("model", type=INPUT_PATH)
-@click.option("-o", "--output", type=OUTPUT, metavar="DIR", required=True, help="The folder to write.")
+@click.option("-o", "--output", type=OUTPUT_FOLDER, metavar="DIR", required=True, help="The folder to write.")
 @click.option(
     "--data",
     type=INPUT_PATH,

@@ -23,7 +23,7 @@ from hyrfpack.cli.common import (
 from hyrfpack.cli.live import serve_training_view, view_options
 from hyrfpack.cli.processes import processes_option
 from hyrfpack.cli.settings import reject_two_sizes, settings_options
-from hyrfpack.cli.types import INPUT_PATH, OUTPUT
+from hyrfpack.cli.types import INPUT_PATH, OUTPUT, OUTPUT_FOLDER
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfNoPosesError
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @click.command(short_help="Train a model on photos with poses.")
 @click.argument("data", type=INPUT_PATH)
-@click.option("-o", "--output", "out", type=OUTPUT, required=True, metavar="RUN", help="Folder of the run.")
+@click.option("-o", "--output", "out", type=OUTPUT_FOLDER, required=True, metavar="RUN", help="Folder of the run.")
 @settings_options(
     TrainConfig, "steps", "early_stop", "resolution_schedule", "max_gaussians", "target_bytes", "preset", "seed"
 )

@@ -9,6 +9,9 @@ from typing import Any
 
 import click
 
+from hyrfpack.outputs.names import ARCHIVE_SUFFIXES, READABLE_PICTURE_SUFFIXES, VIDEO_SUFFIXES
+from hyrfpack.splats.names import SPLATS_SUFFIXES
+
 _SIZE_PATTERN = re.compile(r"([0-9.]+)\s*([kmg]?)b?", re.IGNORECASE)
 
 
@@ -36,6 +39,33 @@ class _OutputPath(click.ParamType):
 
 
 OUTPUT = _OutputPath()
+
+# Suffixes of names that are meant for a file. A new folder of such a name would be taken for the file.
+_FILE_SUFFIXES = (
+    *(".hyrf", ".html", ".json"),
+    *SPLATS_SUFFIXES,
+    *READABLE_PICTURE_SUFFIXES,
+    *VIDEO_SUFFIXES,
+    *ARCHIVE_SUFFIXES,
+)
+
+
+class _OutputFolder(_OutputPath):
+    """Path of a folder of results. A new folder may not have the suffix of a file."""
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        path = super().convert(value, param, ctx)
+        if path.suffix.lower() in _FILE_SUFFIXES and not path.exists():
+            self.fail(
+                f"'{path}' is the name of a {path.suffix} file, but a folder is written; "
+                f"give the name of a folder, such as '{path.with_suffix('')}'",
+                param,
+                ctx,
+            )
+        return path
+
+
+OUTPUT_FOLDER = _OutputFolder()
 
 
 class _Size(click.ParamType):

@@ -506,7 +506,7 @@ def test_the_module_runs_as_a_program():
 @pytest.mark.parametrize("option", [("--test-every", 8), ("--images", "i"), ("--max-size", 0), ("--model", 1)])
 @pytest.mark.parametrize("command", ["render", "compress", "export", "edit", "split"])
 def test_options_for_reading_photos_need_the_folder_of_photos(command, option, packed, tmp_path):
-    message = refused(command, packed, "-o", tmp_path / "out.ply", *option)
+    message = refused(command, packed, "-o", tmp_path / "out", *option)
     assert message == f"Error: {option[0]} is for reading photos; name their folder with --data"
     assert not list(tmp_path.iterdir())
 
@@ -519,6 +519,35 @@ def test_an_empty_path_is_not_the_current_folder(words, tmp_path, monkeypatch):
     command, *options = words.split()
     assert "'' is not a path; give the path of a file or a folder" in refused(command, "", *options)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "file"),
+    [
+        ("train photos -o fox.hyrf", "fox.hyrf"),
+        ("render fox.hyrf -o fox.PNG", "fox.PNG"),
+        ("split fox.hyrf -o parts/fox.hyrf", "parts/fox.hyrf"),
+        ("poses photos -o transforms.json", "transforms.json"),
+        ("demo -o demo.html", "demo.html"),
+        ("evaluate fox.hyrf --data photos --pictures errors.jpg", "errors.jpg"),
+        ("compress fox.hyrf -o small.hyrf --report report.html", "report.html"),
+        ("make photos -o fox.html --work fox.zip", "fox.zip"),
+    ],
+)
+def test_a_new_folder_of_results_has_no_name_of_a_file(words, file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    stem, extension = file.split(".")
+    assert refused(*words.split()).endswith(
+        f"'{file}' is the name of a .{extension} file, but a folder is written; "
+        f"give the name of a folder, such as '{stem}'"
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_existing_folder_with_the_name_of_a_file_is_used(packed, tmp_path):
+    (tmp_path / "fox.hyrf").mkdir()
+    succeeded("render", packed, "-o", tmp_path / "fox.hyrf", "--orbit", 1)
+    assert [file.name for file in (tmp_path / "fox.hyrf").iterdir() if not file.name.startswith(".")] == ["0000.png"]
 
 
 def test_every_input_path_is_checked_for_being_empty():
