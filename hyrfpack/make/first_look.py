@@ -17,6 +17,7 @@ from hyrfpack.data.folder import first_readable_photo, list_photos, read_photo_f
 from hyrfpack.data.pictures import fit_size, read_pixels
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.logs import log_only_errors_of
+from hyrfpack.parallel.threads import thread_count
 from hyrfpack.progress import Event, Progress, StepEvent, TaskEvent
 from hyrfpack.scene import evenly_spaced
 from hyrfpack.train import Trainer
@@ -83,7 +84,7 @@ def _reduce_photos(source: Path, folder: Path) -> bool:
     targets = [folder / path.parent.relative_to(source) / f"{n:04}.jpg" for n, path in enumerate(chosen)]
     for parent in {target.parent for target in targets}:
         parent.mkdir(parents=True, exist_ok=True)
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(thread_count()) as pool:
         list(pool.map(_reduce_photo, chosen, targets))
     return True
 

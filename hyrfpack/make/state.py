@@ -13,6 +13,7 @@ from typing import Any
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.parallel.threads import thread_count
 
 RECORD_NAME = "make.json"
 RECORD_VERSION = 1
@@ -192,7 +193,7 @@ def file_digest(path: Path) -> str:
 def files_digest(files: Iterable[os.PathLike[str] | str], root: Path) -> str:
     """Return one digest of files and their paths relative to `root`; it does not depend on where `root` lies."""
     paths = sorted({os.path.relpath(file, root): Path(file) for file in files}.items())
-    with ThreadPoolExecutor() as pool:  # reading and hashing release the interpreter lock
+    with ThreadPoolExecutor(thread_count()) as pool:  # reading and hashing release the interpreter lock
         digests = pool.map(file_digest, (path for _, path in paths))
         lines = [f"{name}\0{value}\n" for (name, _), value in zip(paths, digests, strict=True)]
     return hashlib.blake2b("".join(lines).encode("utf-8", "surrogateescape"), digest_size=20).hexdigest()
