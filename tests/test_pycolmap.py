@@ -1,4 +1,4 @@
-"""hyrfpack loads zlib before pycolmap.
+"""hyrfpack loads zlib before pycolmap, and SIGTERM ends the process as before.
 
 pycolmap contains its own zlib. If the system's zlib is loaded after it, memory is corrupted and the process aborts.
 All of these tests run in fresh interpreters, because an earlier import of zlib (as by some versions of numpy) would
@@ -8,6 +8,7 @@ hide the fault.
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -108,3 +109,14 @@ def test_importing_pycolmap_before_hyrfpack_gives_a_warning(tmp_path):
     done = run_in_new_interpreter("import pycolmap, hyrfpack", tmp_path)
     assert ("import hyrfpack (or zlib) first" in done.stderr) == (sys.platform == "linux")
     assert "Warning" not in run_in_new_interpreter("import zlib, pycolmap, hyrfpack", tmp_path).stderr
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no handlers of SIGTERM")
+@pytest.mark.parametrize("handler", ["", "signal.signal(signal.SIGTERM, lambda *_: print('asked to stop'))\n"])
+def test_sigterm_has_no_handler_of_pycolmap(handler, folder):
+    code = "import os, signal, sys\n" + handler + READ_SCENE_CODE
+    code += "assert 'pycolmap' in sys.modules\nos.kill(os.getpid(), signal.SIGTERM)\n"
+    done = run_in_new_interpreter(code, folder)
+    assert done.stderr == ""
+    expected = (0, "asked to stop\n") if handler else (-signal.SIGTERM, "")
+    assert (done.returncode, done.stdout) == expected

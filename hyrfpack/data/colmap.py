@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hyrfpack.colmap_library import load_pycolmap
 from hyrfpack.counts import format_count
 from hyrfpack.data.assemble import Photo, make_scene, missing_photos_notes, unregistered_note
 from hyrfpack.data.colmap_binary import check_binary_model
@@ -22,7 +23,7 @@ from hyrfpack.data.points import read_ply_points
 from hyrfpack.data.search import COLMAP_TABLES, describe_subfolders, find_photo_folder, find_workspace
 from hyrfpack.data.sidecar_files import find_picture_folder
 from hyrfpack.data.undistort import Lens, brown_coefficients
-from hyrfpack.errors import HyrfDataError, needs_package, short_reason
+from hyrfpack.errors import HyrfDataError, short_reason
 from hyrfpack.scene import Scene
 
 
@@ -192,8 +193,7 @@ def _read_model(model: Path) -> tuple[dict[int, Lens], list[_Image], int, np.nda
     kind = _model_kind(model)
     if kind == ".bin":
         check_binary_model(model)
-    with needs_package(f"{model}: reading COLMAP models"):
-        import pycolmap
+    pycolmap = load_pycolmap(f"{model}: reading COLMAP models")
     names = read_image_names(model / "images.txt") if kind == ".txt" else {}
     try:
         with readable_model(model, kind) as folder:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from hyrfpack.atomic import pending_file
-from hyrfpack.errors import needs_package
+from hyrfpack.colmap_library import load_pycolmap
 from hyrfpack.scene import Camera, evenly_spaced
 from hyrfpack.splats.splats import Splats
 
@@ -45,9 +45,7 @@ def write_colmap(
     Raises:
         HyrfError: pycolmap is missing, a file cannot be written, or a table exists and `overwrite` is False.
     """
-    with needs_package(f"{folder}: writing a COLMAP model"):
-        import pycolmap
-
+    pycolmap = load_pycolmap(f"{folder}: writing a COLMAP model")
     model = pycolmap.Reconstruction()
     numbers: dict[tuple[float, ...], int] = {}
     for image_id, (name, camera) in enumerate(cameras, start=1):
