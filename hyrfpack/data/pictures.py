@@ -34,6 +34,8 @@ _HEIC_EXTENSIONS = (".heic", ".heif", ".hif")
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 # A JPEG is decoded at this ratio of the requested size or more. The PSNR to a full decode is then at least 49 dB.
 _MIN_DRAFT_SIZE_RATIO = 2
+# Phones take photos of 200 million pixels. A picture takes 3 bytes a pixel where it is not decoded at a reduced size.
+MAX_PICTURE_PIXELS = 500_000_000
 
 
 @dataclass(frozen=True)
@@ -121,12 +123,16 @@ def open_picture(path: Path) -> ImageFile:
     Use `read_header` and `read_pixels` for sizes and pixels, because Pillow applies the orientation of TIFF files.
 
     Raises:
-        HyrfDataError: the file is missing, empty, raw, or no picture, or it is HEIC and pillow-heif is not installed.
+        HyrfDataError: the file is missing, empty, raw, no picture, or larger than MAX_PICTURE_PIXELS, or it is HEIC and
+            pillow-heif is not installed.
     """
     shown = display_path(path)
     with needs_package(f"{shown}: reading pictures"):
         from PIL import Image, UnidentifiedImageError
 
+    # Pillow by default warns of pictures of 89 million pixels and refuses those of twice as many.
+    if Image.MAX_IMAGE_PIXELS is not None:
+        Image.MAX_IMAGE_PIXELS = max(Image.MAX_IMAGE_PIXELS, MAX_PICTURE_PIXELS)
     try:
         if path.suffix.lower() in RAW_PHOTO_SUFFIXES:  # many are TIFF files, of which Pillow would read the preview
             raise HyrfDataError(f"{shown}: raw files are not supported", fix=RAW_REMEDY)
@@ -145,6 +151,8 @@ def open_picture(path: Path) -> ImageFile:
             f"{shown}: permission to read the picture is denied",
             fix="check its permissions",
         ) from error
+    except Image.DecompressionBombError as error:
+        raise _too_large_error(shown) from error
     except UnidentifiedImageError as error:  # the text of this exception is only the path
         raise HyrfDataError(
             f"{shown}: not a picture that can be read, its format is unknown",
@@ -160,7 +168,18 @@ def open_picture(path: Path) -> ImageFile:
             f"{shown}: the picture has no pixels ({image.size[0]} x {image.size[1]})",
             fix="replace the file",
         )
+    if image.width * image.height > MAX_PICTURE_PIXELS:
+        image.close()
+        raise _too_large_error(shown)
     return image
+
+
+def _too_large_error(shown: Path) -> HyrfDataError:
+    """Return the exception for a picture with too many pixels."""
+    return HyrfDataError(
+        f"{shown}: the picture has more than {MAX_PICTURE_PIXELS:,} pixels",
+        fix="reduce its size",
+    )
 
 
 def read_header(path: Path) -> PictureHeader:

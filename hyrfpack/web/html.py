@@ -27,6 +27,7 @@ from hyrfpack.web.player import assemble_player_page, json_element
 SPZ_VERSION = 3  # this version is compressed by gzip, which every browser unpacks
 # Quality of the background's WebP, 0 to 100. 95 takes three times the bytes for 0.01 dB in pictures of real scenes.
 BACKGROUND_WEBP_QUALITY = 80
+MAX_BACKGROUND_PIXELS = 1 << 26
 
 # Limits of SPZ, with some room: coordinates have 24 bits, 12 of them fractional, and scales are e^-10 to e^5.9.
 MAX_SPZ_COORDINATE = 2000.0
@@ -245,6 +246,8 @@ def _decode_webp(data: bytes) -> np.ndarray:
     """Decode a WebP picture to (H, W, 3) float32 in [0, 1]."""
     try:
         with Image.open(io.BytesIO(data), formats=("WEBP",)) as picture:
+            if picture.width * picture.height > MAX_BACKGROUND_PIXELS:
+                raise ValueError(f"the background has {picture.width} x {picture.height} pixels")
             return np.asarray(picture.convert("RGB"), np.float32) / 255
     except Image.DecompressionBombError as error:
         raise ValueError(error) from error

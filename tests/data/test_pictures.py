@@ -203,6 +203,24 @@ def test_truncated_png_names_the_file(tmp_path, length):
         read_pixels(tmp_path / "a.png")
 
 
+@pytest.mark.filterwarnings("error")
+def test_photos_of_200_million_pixels_are_read_without_a_warning(tmp_path, monkeypatch):
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 89_478_485)  # Pillow's default
+    Image.new("1", (16320, 12240)).save(tmp_path / "a.png")
+
+    assert read_header(tmp_path / "a.png").size == (16320, 12240)
+
+
+@pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
+def test_a_picture_with_too_many_pixels_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("hyrfpack.data.pictures.MAX_PICTURE_PIXELS", 47)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 30)
+    Image.fromarray(RAMP_PIXELS).save(tmp_path / "a.png")
+
+    with pytest.raises(HyrfDataError, match="a.png: the picture has more than 47 pixels; reduce its size"):
+        read_header(tmp_path / "a.png")
+
+
 def test_missing_picture_names_the_file(tmp_path):
     with pytest.raises(HyrfDataError, match=r"gone\.png.*missing"):
         read_pixels(tmp_path / "gone.png")
