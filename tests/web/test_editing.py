@@ -365,6 +365,15 @@ def test_keys_alone_pick_the_centre_of_the_picture(browser: Browser, tmp_path: P
     )
 
 
+def test_arrow_keys_in_the_text_of_the_command_do_not_move_the_view(browser: Browser, tmp_path: Path):
+    load_editable_page(browser, tmp_path, make_editable_page(make_model(50)), "save")
+    browser.evaluate("document.getElementById('edit-command').focus()")
+    before = window_camera(browser).camera_from_world
+    browser.press("ArrowRight")
+    browser.press("w")
+    np.testing.assert_array_equal(window_camera(browser).camera_from_world, before)
+
+
 # ---- views
 
 

@@ -175,8 +175,8 @@ export class Controls {
 
   key(event) {
     const key = keyName(event), moves = FLY_AXES[key] || LOOK_SIGNS[key] || ZOOM_SIGNS[key];
-    const typing = "select, dialog, input:not([type='range'], [type='checkbox'])";
-    const isForInput = event.target.closest?.(LOOK_SIGNS[key] ? "input, select, dialog" : typing);
+    const typing = "select, dialog, textarea, input:not([type='range'], [type='checkbox'])";
+    const isForInput = event.target.closest?.(LOOK_SIGNS[key] ? "input, select, dialog, textarea" : typing);
     if (event.ctrlKey || event.metaKey || event.altKey || (isForInput && key !== "Escape")) return;
     if (moves || key === "Shift") {
       this.held.set(event.code, key);
