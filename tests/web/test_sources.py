@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import subprocess
 import time
 from pathlib import Path
@@ -117,6 +118,16 @@ def test_a_download_that_cannot_resume_is_reported_in_one_sentence(browser: Brow
     browser.open(f"{host.address}/index.html?content=x.hyrf")
     message = wait_for_message(browser)
     assert "the connection broke after" in message and message.startswith("x.hyrf cannot be opened: ")
+
+
+def test_a_compressed_transfer_of_another_server_may_be_longer_than_the_file(browser: Browser, host: Site):
+    with serve_site() as other_site:  # it does not reveal Content-Encoding
+        other_site.files = {"/scene.hyrf": gzip.compress(GOLDEN_FILE_DATA, compresslevel=0)}
+        other_site.headers = {"Access-Control-Allow-Origin": "*", "Content-Encoding": "gzip"}
+        assert len(other_site.files["/scene.hyrf"]) > len(GOLDEN_FILE_DATA)
+        browser.open(f"{host.address}/index.html?content={other_site.address}/scene.hyrf")
+        assert browser.evaluate("hyrfpack.ready.then(() => '', (error) => error.message)") == ""
+        assert browser.evaluate(LOADED_COUNT_JS) > 0
 
 
 # ---- dropped files
