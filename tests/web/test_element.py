@@ -130,6 +130,16 @@ def test_a_wheel_that_scrolls_the_page_is_explained_for_a_moment(browser: Browse
     wait_until(browser, f"{ELEMENT_JS}.shadowRoot.querySelector('p').hidden")
 
 
+def test_the_hint_about_the_wheel_does_not_replace_an_error(browser: Browser, host: Site):
+    open_element(browser, host, 'src="gone.hyrf"')
+    wait_until(browser, "fired.some(([name]) => name === 'error')")
+    browser.wheel(60, 60, 100)
+    browser.evaluate("new Promise((done) => setTimeout(done, 3000))")
+    assert is_shown(browser, "p")
+    message = browser.evaluate(f"{ELEMENT_JS}.shadowRoot.querySelector('p').textContent")
+    assert message.startswith("gone.hyrf could not be fetched")
+
+
 def test_the_element_works_under_a_policy_of_self(browser: Browser, host: Site):
     script = PAGE.partition("<script>")[2].partition("</script>")[0]
     host.files["/watch.js"] = script.encode()

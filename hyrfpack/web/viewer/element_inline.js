@@ -17,6 +17,7 @@ export class InlineView {
     this.element = element;
     this.viewer = null;
     this.shown = {}; // the values of the attributes at the last update
+    this.isFailed = false; // whether the message is an error
     const make = (name, attributes = {}) => {
       const made = document.createElement(name);
       for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
@@ -83,7 +84,10 @@ export class InlineView {
     this.viewer.on("progress", ({ progress }) => {
       this.bar.hidden = progress >= 1;
       this.bar.value = progress;
-      if (progress < 1) this.message.hidden = true;
+      if (progress < 1) {
+        this.message.hidden = true;
+        this.isFailed = false;
+      }
       this.element.fireEvent("progress", progress);
     });
     this.viewer.on("camera", () => {
@@ -106,14 +110,16 @@ export class InlineView {
   // Shows an error until the next scene is loaded.
   fail({ message }) {
     clearTimeout(this.hintTimer);
+    this.isFailed = true;
     this.bar.hidden = true;
     this.message.textContent = message;
     this.message.hidden = false;
     this.element.fireEvent("error", message);
   }
 
-  // Shows a hint for a moment.
+  // Shows a hint for a moment, but not in place of an error.
   hint(text) {
+    if (this.isFailed) return;
     clearTimeout(this.hintTimer);
     this.message.textContent = text;
     this.message.hidden = false;
