@@ -60,8 +60,9 @@ export class InlineView {
       if (now.src !== before.src) {
         this.viewer.firstCamera = now.camera;
         this.viewer.load(now.src).catch(() => {}); // the event has reported it
-      } else if (now.camera !== before.camera && now.camera !== null && this.viewer.scene) {
-        this.viewer.moveTo(now.camera);
+      } else if (now.camera !== before.camera) {
+        if (!this.viewer.scene) this.viewer.firstCamera = now.camera;
+        else if (now.camera !== null) this.viewer.moveTo(now.camera);
       }
     } catch (error) {
       this.fail(error);
