@@ -132,6 +132,16 @@ def test_an_element_without_src_shows_nothing_and_waits(browser: Browser, host: 
     wait_until(browser, LOADED_JS)
 
 
+def test_an_element_whose_src_is_removed_frees_its_scene(browser: Browser, host: Site):
+    open_element(browser, host)
+    wait_until(browser, LOADED_JS)
+    browser.evaluate(f"window.gl = {ELEMENT_JS}.viewer.player.renderer.gl, {ELEMENT_JS}.removeAttribute('src')")
+    wait_until(browser, f"{ELEMENT_JS}.viewer === null && gl.isContextLost()")
+    assert browser.evaluate(f"{ELEMENT_JS}.shadowRoot.querySelector('canvas') === null")
+    browser.evaluate(f"fired.length = 0, {ELEMENT_JS}.setAttribute('src', 'cloud.spz')")
+    wait_until(browser, LOADED_JS)
+
+
 def test_a_wheel_that_scrolls_the_page_is_explained_for_a_moment(browser: Browser, host: Site):
     open_element(browser, host)
     wait_until(browser, LOADED_JS)

@@ -34,11 +34,19 @@ export class InlineView {
   }
 
   dispose() {
+    this.close();
+    this.placement.disconnect();
+    this.root.remove();
+  }
+
+  // Frees the viewer, and hides what it shows.
+  close() {
     clearTimeout(this.hintTimer);
     this.viewer?.destroy();
     this.viewer = null;
-    this.placement.disconnect();
-    this.root.remove();
+    this.isFailed = false;
+    this.bar.hidden = this.message.hidden = true;
+    this.root.classList.remove("drawn");
   }
 
   // Follows the element's attributes.
@@ -46,10 +54,7 @@ export class InlineView {
     const { element, shown: before } = this;
     const now = Object.fromEntries(INLINE_ATTRIBUTES.map((name) => [name, element.getAttribute(name)]));
     this.shown = now;
-    if (this.viewer && FIXED_ATTRIBUTES.some((name) => now[name] !== before[name])) {
-      this.viewer.destroy();
-      this.viewer = null;
-    }
+    if (now.src === null || FIXED_ATTRIBUTES.some((name) => now[name] !== before[name])) this.close();
     if (now.poster !== before.poster) this.showPoster(now.poster);
     if (now.src === null) return;
     try {
@@ -70,7 +75,6 @@ export class InlineView {
   }
 
   create({ src, camera, title, exposure, autorotate, interaction, loading, worker }) {
-    this.root.classList.remove("drawn");
     this.viewer = createViewer({
       container: this.container,
       src,
