@@ -214,6 +214,14 @@ def test_a_lazy_viewer_loads_nothing_until_it_is_near_the_window(browser: Browse
     assert browser.evaluate("low.scene.count") == 300
 
 
+def test_a_viewer_is_ready_again_if_the_next_scene_cannot_be_loaded(browser: Browser, site: Site):
+    open_viewer(browser, site, CREATE_JS + "window.fails = createViewer({ container: '#box', src: 'gone.hyrf' });")
+    wait_until(browser, READY_JS)
+    assert "404" in error_of(browser, "viewer.load('gone.hyrf')")
+    assert browser.evaluate("[viewer.isReady, viewer.progress]") == [True, 1]
+    assert browser.evaluate("[fails.isReady, fails.progress, fails.scene]") == [False, 0, None]
+
+
 def test_viewers_off_screen_and_paused_ones_draw_no_frames(browser: Browser, site: Site):
     script = CREATE_JS + "window.low = createViewer({ container: '#low', src: 'cloud.spz', autorotate: true });"
     open_viewer(browser, site, script, TWO_BOXES_HTML)

@@ -53,6 +53,7 @@ class Viewer {
     this.progress = 0;
     this.lastLoad = 0; // the number of the last load
     this.isReady = false;
+    this.readyLoader = null; // that of the last scene that was loaded completely
     this.isDestroyed = false;
     this.isPaused = false; // by `pause`
     this.isVisible = true; // whether the container is in the window, or near it
@@ -144,12 +145,15 @@ class Viewer {
       if (thisLoad === this.lastLoad) await this.player.open(file);
     } catch (error) {
       if (thisLoad === this.lastLoad && !(error instanceof SupersededError)) {
+        this.isReady = this.readyLoader !== null && this.readyLoader === this.player.loader; // an earlier scene stays
+        if (this.isReady) this.progress = 1;
         this.emit("error", { error });
         throw error;
       }
     }
     if (thisLoad !== this.lastLoad) throw new DOMException("Another scene was loaded instead.", "AbortError");
     this.isReady = true;
+    this.readyLoader = this.player.loader;
     this.emit("ready", { scene: this.scene });
   }
 
