@@ -39,7 +39,7 @@ export interface ViewerOptions {
   /** The first camera of the first scene. */
   camera?: CameraName | null;
   exposure?: Exposure;
-  /** Turn slowly while the user makes no input. */
+  /** Turn slowly while the user makes no input, unless the user prefers reduced motion. */
   autorotate?: boolean;
   /**
    * "after-click" (the default): wheel and fingers scroll the page until the scene is clicked. "always": they move the

@@ -142,6 +142,20 @@ def test_an_element_whose_src_is_removed_frees_its_scene(browser: Browser, host:
     wait_until(browser, LOADED_JS)
 
 
+def test_reduced_motion_prevents_autorotation_until_a_script_requests_it(browser: Browser, host: Site):
+    browser.prefer(less_motion=True)
+    try:
+        open_element(browser, host, 'src="cloud.spz" autorotate')
+        wait_until(browser, LOADED_JS)
+        assert not browser.evaluate(f"{ELEMENT_JS}.viewer.autorotate")
+        for _ in range(2):
+            browser.evaluate(f"{ELEMENT_JS}.toggleAttribute('autorotate'), new Promise((done) => setTimeout(done, 50))")
+            assert not browser.evaluate(f"{ELEMENT_JS}.viewer.autorotate")
+        assert browser.evaluate(f"({ELEMENT_JS}.viewer.autorotate = true, {ELEMENT_JS}.viewer.autorotate)")
+    finally:
+        browser.prefer()
+
+
 def test_a_wheel_that_scrolls_the_page_is_explained_for_a_moment(browser: Browser, host: Site):
     open_element(browser, host)
     wait_until(browser, LOADED_JS)

@@ -2,6 +2,7 @@
 
 import { createViewer } from "./viewer.js";
 import { AS_PHOTOGRAPHED } from "./exposure.js";
+import { prefersReducedMotion } from "./motion.js";
 import { keepPlaced } from "./poster.js";
 import { siblingAddress } from "./script_address.js";
 
@@ -61,7 +62,9 @@ export class InlineView {
       if (!this.viewer) return this.create(now);
       if (now.title !== before.title) this.viewer.canvas.setAttribute("aria-label", now.title ?? "3D scene");
       if (now.exposure !== before.exposure) this.viewer.exposure = now.exposure ?? AS_PHOTOGRAPHED;
-      if (now.autorotate !== before.autorotate) this.viewer.autorotate = now.autorotate !== null;
+      if (now.autorotate !== before.autorotate) {
+        this.viewer.autorotate = now.autorotate !== null && !prefersReducedMotion();
+      }
       if (now.src !== before.src) {
         this.viewer.firstCamera = now.camera;
         this.viewer.load(now.src).catch(() => {}); // the event has reported it

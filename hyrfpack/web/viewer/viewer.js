@@ -4,6 +4,7 @@ import { formatCamera, parseCamera } from "./address.js";
 import { cameraOf, toWorld, viewOf } from "./camera.js";
 import { AS_PHOTOGRAPHED, EXPOSURES } from "./exposure.js";
 import { SupersededError } from "./loader.js";
+import { prefersReducedMotion } from "./motion.js";
 import { Navigation } from "./navigation.js";
 import { Player } from "./player.js";
 import { Renderer } from "./renderer.js";
@@ -64,7 +65,7 @@ class Viewer {
       rootMargin: LAZY_MARGIN,
     });
     this.observer.observe(this.container);
-    if (autorotate) this.autorotate = true;
+    if (autorotate && !prefersReducedMotion()) this.autorotate = true;
     if (src !== null && !this.pending) this.load(src, { name }).catch(() => {}); // `load` has emitted the error
   }
 
