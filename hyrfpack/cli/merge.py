@@ -47,8 +47,8 @@ def merge(
     """Put MODELS, .hyrf files or folders of runs, into one file, in which they are drawn together.
 
     The first model is the scene: its background and its viewpoint are those of the file. NAME is the name of a file
-    without its folder and ending. Moves are applied in the order in which they are given. The models themselves are
-    copied unchanged.
+    without its folder and ending, or that of a run's folder. Moves are applied in the order in which they are given.
+    The models themselves are copied unchanged.
 
     \b
     Examples:

@@ -159,7 +159,13 @@ def render(
         else:
             picture_of = make_renderer(shown, geometry=geometry, settings=settings)
         pictures = write_pictures(picture_of, named, output, geometry=writer, overwrite=overwrite, ranks=ranks)
-        written = list(show_item_progress(pictures, len(ranks.share(named)), "render", "picture"))
+        count, written = len(ranks.share(named)), []
+        try:
+            for path in show_item_progress(pictures, count, "render", "picture"):
+                written.append(path)
+        except KeyboardInterrupt:
+            note(f"{output}: {len(written):,} of {format_count(count, 'picture')} were written")
+            raise
         return written, writer.max_depth if writer else 0.0
 
     # This first check ignores existing files. It prevents the creation of a folder where nothing may be written.

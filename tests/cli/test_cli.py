@@ -550,6 +550,18 @@ def test_an_existing_folder_with_the_name_of_a_file_is_used(packed, tmp_path):
     assert [file.name for file in (tmp_path / "fox.hyrf").iterdir() if not file.name.startswith(".")] == ["0000.png"]
 
 
+def test_an_interrupted_rendering_says_what_was_written(packed, tmp_path, monkeypatch):
+    def write_two(*_args, **_settings):
+        yield tmp_path / "out/0000.png"
+        yield tmp_path / "out/0001.png"
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hyrfpack.render.files.write_pictures", write_two)
+    result = hyrfpack("render", packed, "-o", tmp_path / "out", "--orbit", 1000)
+    assert result.exit_code == 1
+    assert f"{tmp_path / 'out'}: 2 of 1,000 pictures were written" in result.stderr.splitlines()
+
+
 def test_every_input_path_is_checked_for_being_empty():
     given = [option for command in main.commands.values() for option in command.params]
     paths = [option for option in given if isinstance(option.type, click.Path)]
