@@ -2,12 +2,16 @@ import type { Camera, Viewer } from "./index.js";
 
 /** The element <hyrf-viewer>, which importing this module defines. */
 export interface HyrfViewerElement extends HTMLElement {
-  /** The viewer, or null: with the attribute `frame`, without `src`, or while the element is in no page. */
+  /**
+   * The viewer, or null: with the attribute `frame`, without `src`, while the element is in no page, or while it has no
+   * viewer yet or any longer. A lazy element gets one when it comes near the window. A page keeps at most 12: elements
+   * that left the window may lose theirs, and get a new one when they come back. The event `load` reports it.
+   */
   readonly viewer: Viewer | null;
 }
 
 export interface HyrfViewerEventMap {
-  /** A scene is loaded. */
+  /** A scene is loaded, for the first time or in a new viewer. */
   load: CustomEvent<string>;
   /** Something failed; `detail` is a sentence for the user. */
   error: CustomEvent<string>;

@@ -91,10 +91,10 @@ def test_a_plain_page_shows_two_viewers(browser: Browser, host: Site, package: P
     host.files["/scene.hyrf"] = GOLDEN_FILE_DATA
     browser.open(f"{host.address}/page.html")
     wait_until(browser, STATUS_JS, 30)
-    assert not browser.evaluate("document.getElementById('second').viewer.isReady"), "the second one is lazy"
+    assert browser.evaluate("document.getElementById('second').viewer") is None, "the second one is lazy"
     browser.evaluate("document.getElementById('next').click()")
     browser.evaluate("document.getElementById('second').scrollIntoView()")
-    wait_until(browser, "document.getElementById('second').viewer.isReady", 30)
+    wait_until(browser, "document.getElementById('second').viewer?.isReady", 30)
     assert browser.list_errors() == []
 
 

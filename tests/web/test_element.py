@@ -74,11 +74,13 @@ def test_the_first_camera_is_that_of_the_attribute(browser: Browser, host: Site)
 
 
 def test_a_camera_that_is_set_before_the_scene_is_loaded_is_the_first_one(browser: Browser, host: Site):
-    open_element(browser, host, "src='some scene.hyrf' loading='lazy' style='margin-top: 3000px'")
-    wait_until(browser, f"Boolean({ELEMENT_JS}.viewer)")
+    open_element(browser, host, "")
     camera = "0.5,0.2,-3,1,0,0,0,1.2,3"
-    browser.evaluate(f"{ELEMENT_JS}.setAttribute('camera', '{camera}')")
-    browser.evaluate(f"{ELEMENT_JS}.scrollIntoView()")
+    was_loading = browser.evaluate(
+        f"(async (element) => {{ element.setAttribute('src', 'some scene.hyrf'); await null; await null;"
+        f" element.setAttribute('camera', '{camera}'); return element.viewer?.isReady === false; }})({ELEMENT_JS})"
+    )
+    assert was_loading
     wait_until(browser, LOADED_JS)
     found = browser.evaluate(f"{ELEMENT_JS}.viewer.cameraText").split(",")
     assert [float(text) for text in found[:7]] == pytest.approx([0.5, 0.2, -3, 1, 0, 0, 0], abs=1e-3)

@@ -43,7 +43,8 @@ class HyrfViewerElement extends (globalThis.HTMLElement ?? class {}) {
     this.isScheduled = false;
   }
 
-  // Returns the viewer of createViewer, or null: in a frame, without a `src`, or while the element is in no page.
+  // Returns the viewer of createViewer, or null: in a frame, without a `src`, while the element is in no page, or while
+  // its scene waits for the element to come near the window (see element_limit.js).
   get viewer() {
     return this.view?.viewer ?? null;
   }

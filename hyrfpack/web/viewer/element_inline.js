@@ -1,6 +1,7 @@
 // Draws the scene of a <hyrf-viewer> in its shadow tree.
 
 import { createViewer } from "./viewer.js";
+import { MAX_SCENES, addView, assignScenes, handleLostContext, removeView } from "./element_limit.js";
 import { AS_PHOTOGRAPHED } from "./exposure.js";
 import { prefersReducedMotion } from "./motion.js";
 import { keepPlaced } from "./poster.js";
@@ -11,6 +12,8 @@ export const INLINE_ATTRIBUTES = [
 ];
 const FIXED_ATTRIBUTES = ["interaction", "worker"]; // a change makes a new viewer
 const HINT_MS = 2500;
+const WAITING_TEXT = `Only ${MAX_SCENES} scenes are drawn at a time; scroll others out of the window to see this one.`;
+const LOST_TEXT = "The graphics device was lost; drawing resumes when it is back.";
 const HINTS = { wheel: "Click the scene, then the wheel zooms.", finger: "Tap the scene, then fingers move it." };
 
 export class InlineView {
@@ -18,6 +21,9 @@ export class InlineView {
     this.element = element;
     this.viewer = null;
     this.shown = {}; // the values of the attributes at the last update
+    this.isPending = false; // whether there is a scene to show, but no viewer
+    this.isEager = false; // whether a pending scene is also shown far from the window
+    this.cameraText = null; // the camera of the scene before it was suspended
     this.isFailed = false; // whether the message is an error
     const make = (name, attributes = {}) => {
       const made = document.createElement(name);
@@ -32,10 +38,12 @@ export class InlineView {
     this.message = make("p", { role: "status", part: "message", hidden: "" });
     this.root.append(this.poster, this.container, this.bar, this.message);
     element.shadowRoot.append(this.root);
+    addView(this);
   }
 
   dispose() {
     this.close();
+    removeView(this);
     this.placement.disconnect();
     this.root.remove();
   }
@@ -46,8 +54,29 @@ export class InlineView {
     this.viewer?.destroy();
     this.viewer = null;
     this.isFailed = false;
+    this.isPending = false;
     this.bar.hidden = this.message.hidden = true;
     this.root.classList.remove("drawn");
+  }
+
+  // Frees the viewer until the element is near the window again, and the page has room for it.
+  suspend() {
+    this.cameraText = this.viewer?.cameraText ?? this.cameraText;
+    this.close();
+    this.isPending = true;
+    this.isEager = false;
+    if (this.isVisible) this.showMessage(WAITING_TEXT);
+  }
+
+  // Shows a pending scene.
+  open() {
+    if (!this.isPending) return;
+    this.close();
+    try {
+      this.create({ ...this.shown, camera: this.cameraText ?? this.shown.camera });
+    } catch (error) {
+      this.fail(error);
+    }
   }
 
   // Follows the element's attributes.
@@ -55,11 +84,15 @@ export class InlineView {
     const { element, shown: before } = this;
     const now = Object.fromEntries(INLINE_ATTRIBUTES.map((name) => [name, element.getAttribute(name)]));
     this.shown = now;
+    if (now.src !== before.src || now.camera !== before.camera) this.cameraText = null;
     if (now.src === null || FIXED_ATTRIBUTES.some((name) => now[name] !== before[name])) this.close();
     if (now.poster !== before.poster) this.showPoster(now.poster);
-    if (now.src === null) return;
+    if (!this.viewer) {
+      this.isPending = now.src !== null;
+      this.isEager = now.loading !== "lazy";
+      return assignScenes();
+    }
     try {
-      if (!this.viewer) return this.create(now);
       if (now.title !== before.title) this.viewer.canvas.setAttribute("aria-label", now.title ?? "3D scene");
       if (now.exposure !== before.exposure) this.viewer.exposure = now.exposure ?? AS_PHOTOGRAPHED;
       if (now.autorotate !== before.autorotate) {
@@ -107,7 +140,19 @@ export class InlineView {
       this.element.fireEvent("load", "");
     });
     this.viewer.on("error", ({ error }) => this.fail(error));
+    this.watchContext(this.viewer);
     this.viewer.on("ignored", ({ kind }) => this.hint(HINTS[kind]));
+  }
+
+  // Shows the poster and a message while the browser has taken the graphics context away.
+  watchContext(viewer) {
+    viewer.canvas.addEventListener("webglcontextlost", () => {
+      if (this.viewer !== viewer) return; // it was freed
+      this.root.classList.remove("drawn");
+      if (!this.isFailed) this.showMessage(LOST_TEXT);
+      handleLostContext(this);
+    });
+    viewer.canvas.addEventListener("webglcontextrestored", () => (this.message.hidden = !this.isFailed));
   }
 
   showPoster(address) {
@@ -117,20 +162,22 @@ export class InlineView {
 
   // Shows an error until the next scene is loaded.
   fail({ message }) {
-    clearTimeout(this.hintTimer);
     this.isFailed = true;
     this.bar.hidden = true;
-    this.message.textContent = message;
-    this.message.hidden = false;
+    this.showMessage(message);
     this.element.fireEvent("error", message);
   }
 
   // Shows a hint for a moment, but not in place of an error.
   hint(text) {
     if (this.isFailed) return;
+    this.showMessage(text);
+    this.hintTimer = setTimeout(() => (this.message.hidden = true), HINT_MS);
+  }
+
+  showMessage(text) {
     clearTimeout(this.hintTimer);
     this.message.textContent = text;
     this.message.hidden = false;
-    this.hintTimer = setTimeout(() => (this.message.hidden = true), HINT_MS);
   }
 }
