@@ -112,3 +112,13 @@ def test_a_distant_element_whose_context_was_taken_away_is_drawn_when_it_is_visi
     one_browser.evaluate(TAKE_CONTEXTS_JS)
     wait_until(one_browser, "elementAt(1).viewer === null")
     show_element(one_browser, 1)
+
+
+def test_an_element_that_comes_back_without_its_context_gets_a_new_viewer(one_browser: Browser, host: Site):
+    open_elements(one_browser, host, count=3, gap=2000)
+    wait_until(one_browser, "isDrawn(0)")
+    one_browser.evaluate(TAKE_CONTEXTS_JS)
+    wait_until(one_browser, "partOf(0, 'p').checkVisibility()")
+    show_element(one_browser, 2)
+    show_element(one_browser, 0)
+    assert not one_browser.evaluate("partOf(0, 'p').checkVisibility()")

@@ -25,6 +25,7 @@ export class InlineView {
     this.isEager = false; // whether a pending scene is also shown far from the window
     this.cameraText = null; // the camera of the scene before it was suspended
     this.isFailed = false; // whether the message is an error
+    this.isLost = false; // whether the browser has taken the graphics context away
     const make = (name, attributes = {}) => {
       const made = document.createElement(name);
       for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
@@ -53,8 +54,7 @@ export class InlineView {
     clearTimeout(this.hintTimer);
     this.viewer?.destroy();
     this.viewer = null;
-    this.isFailed = false;
-    this.isPending = false;
+    this.isFailed = this.isLost = this.isPending = false;
     this.bar.hidden = this.message.hidden = true;
     this.root.classList.remove("drawn");
   }
@@ -148,11 +148,15 @@ export class InlineView {
   watchContext(viewer) {
     viewer.canvas.addEventListener("webglcontextlost", () => {
       if (this.viewer !== viewer) return; // it was freed
+      this.isLost = true;
       this.root.classList.remove("drawn");
       if (!this.isFailed) this.showMessage(LOST_TEXT);
       handleLostContext(this);
     });
-    viewer.canvas.addEventListener("webglcontextrestored", () => (this.message.hidden = !this.isFailed));
+    viewer.canvas.addEventListener("webglcontextrestored", () => {
+      this.isLost = false;
+      this.message.hidden = !this.isFailed;
+    });
   }
 
   showPoster(address) {

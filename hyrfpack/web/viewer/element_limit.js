@@ -27,6 +27,7 @@ function makeObserver(field, rootMargin) {
     for (const { target, isIntersecting } of entries) {
       const view = [...views].find(({ element }) => element === target);
       if (!view) continue;
+      if (view.isLost && isIntersecting && !view.isVisible) view.suspend(); // a new viewer gets another context
       view[field] = isIntersecting;
       views.delete(view);
       views.add(view);
