@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -208,7 +209,7 @@ def resolve_model_file(path: Path) -> Path:
         model = Path(path.stem).with_suffix(".hyrf")
         raise HyrfError(
             f"{path}: these are splats, not a model",
-            fix=f"import it first: 'hyrfpack import {path} -o {model}'",
+            fix=f"import it first: 'hyrfpack import {shlex.quote(str(path))} -o {shlex.quote(str(model))}'",
         )
     return find_model(path)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -171,14 +172,16 @@ def _splats_error(source: Path, output: Path, kind: FileKind) -> HyrfError:
     """Return the error that names the right command for splats of another program."""
     from hyrfpack.splats.table import FORMATS
 
+    name = shlex.quote(str(source))
     if kind.ending in FORMATS:
         return HyrfError(
-            f"{source}: these are splats, not a model", fix=f"convert them with 'hyrfpack convert {source} {output}'"
+            f"{source}: these are splats, not a model",
+            fix=f"convert them with 'hyrfpack convert {name} {shlex.quote(str(output))}'",
         )
     return HyrfError(
         f"{source}: only a folder (-o player/) can play splats",
-        fix=f"to write {kind.ending or 'this'}, import them first: 'hyrfpack import {source} -o "
-        f"{source.with_suffix('.hyrf').name}'",
+        fix=f"to write {kind.ending or 'this'}, import them first: 'hyrfpack import {name} -o "
+        f"{shlex.quote(source.with_suffix('.hyrf').name)}'",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -142,6 +143,6 @@ def _viewing_hint(result: MakeResult) -> str:
     if output.suffix.lower() == ".html":
         return "open it in a browser"
     if output.is_dir():
-        return f"for any web server; see it with 'hyrfpack view {result.model}'"
+        return f"for any web server; see it with 'hyrfpack view {shlex.quote(str(result.model))}'"
     viewable = output.suffix.lower() in (".hyrf", ".ply", ".splat", ".spz", ".sog") and ".points." not in output.name
-    return f"see it with 'hyrfpack view {output if viewable else result.model}'"
+    return f"see it with 'hyrfpack view {shlex.quote(str(output if viewable else result.model))}'"

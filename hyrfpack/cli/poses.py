@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
@@ -69,4 +70,5 @@ def _print_result(result: PosesReport) -> None:
         names = [name for name, why in result.left_out.items() if why == reason]
         more = f" and {count - _MAX_NAMED_PHOTOS} more" if count > _MAX_NAMED_PHOTOS else ""
         click.echo(f"left out, {reason}: {', '.join(names[:_MAX_NAMED_PHOTOS])}{more}")
-    click.echo(f"next: hyrfpack train {result.scene} -o runs/{result.scene.resolve().name}")
+    run = f"runs/{result.scene.resolve().name}"
+    click.echo(f"next: hyrfpack train {shlex.quote(str(result.scene))} -o {shlex.quote(run)}")

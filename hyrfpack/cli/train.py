@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -178,7 +179,7 @@ def train(
             consistent = format_consistent_psnr(scores.get("psnr_consistent"))
             click.echo(f"held-out views: {scores['psnr']:.2f} dB{consistent}, SSIM {scores['ssim']:.4f}")
         if view:
-            note(f"to see the model again, run 'hyrfpack view {result.model}'")
+            note(f"to see the model again, run 'hyrfpack view {shlex.quote(str(result.model))}'")
     if not result.complete:
         click.get_current_context().exit(1)
 

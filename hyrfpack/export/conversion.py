@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
@@ -166,7 +167,7 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
         if Path(source).suffix.lower() == ".hyrf":
             raise HyrfError(
                 f"{source}: this is a model, not splats",
-                fix=f"write it with 'hyrfpack export {source} -o {target}'",
+                fix=f"write it with 'hyrfpack export {shlex.quote(str(source))} -o {shlex.quote(str(target))}'",
             )
         if (Path(source) / STREAMED_SOG_FOLDER.ending).is_file():
             raise HyrfError(
@@ -180,7 +181,7 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
     if Path(target).suffix.lower() == ".hyrf":
         raise HyrfError(
             f"{target}: splats are imported as a model, not converted",
-            fix=f"run 'hyrfpack import {source} -o {target}'",
+            fix=f"run 'hyrfpack import {shlex.quote(str(source))} -o {shlex.quote(str(target))}'",
         )
     kind = find_kind_by_ending(target)
     if not isinstance(kind, SplatFormat):

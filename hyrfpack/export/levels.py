@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -77,7 +78,8 @@ def open_levels(source: str | os.PathLike[str]) -> SceneFolder:
     if not is_scene(source):
         raise HyrfError(
             f"{source}: this model has no levels of detail to stream",
-            fix=f"split it first with 'hyrfpack split {source} -o scene', and export the folder 'scene'",
+            fix=f"split it first with 'hyrfpack split {shlex.quote(str(source))} -o scene', "
+            "and export the folder 'scene'",
         )
     return SceneFolder(source)
 

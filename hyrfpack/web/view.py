@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
@@ -81,7 +82,7 @@ def find_playable_file(path: str | os.PathLike[str]) -> Path:
     if sog_folder(path) is not None:
         raise HyrfDataError(
             f"{path}: a page plays single files",
-            fix=f"bundle these with 'hyrfpack convert {path} scene.sog'",
+            fix=f"bundle these with 'hyrfpack convert {shlex.quote(str(path))} scene.sog'",
         )
     return Path(path)
 

@@ -119,6 +119,8 @@ def test_progress_is_reported_in_order(tmp_path):
         ("model.hyrf", "a.ply", "this is a model, not splats; write it with 'hyrfpack export model.hyrf -o a.ply'"),
         ("photo.png", "a.ply", "this is not a file of splats"),
         ("a.ply", "b.hyrf", "are imported as a model, not converted; run 'hyrfpack import a.ply -o b.hyrf'"),
+        ("my ball.hyrf", "a.ply", "write it with 'hyrfpack export 'my ball.hyrf' -o a.ply'"),
+        ("a.ply", "my ball.hyrf", "run 'hyrfpack import a.ply -o 'my ball.hyrf''"),
         ("a.ply", "b.compressed.ply", "compressed PLY is read, not written"),
         ("a.ply", "b.mesh.ply", ".mesh.ply is not a format of splats; use one of .ply, .splat"),
         ("a.ply", "b.POINTS.glb", ".points.glb is not a format of splats"),
