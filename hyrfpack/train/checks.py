@@ -29,6 +29,11 @@ def check_folder(
     elif resume and not (out / CHECKPOINT_FILE).is_file():
         if (out / BLOCKS_JOURNAL_FILE).is_file():
             raise HyrfError(f"{out}: the run in this folder is one in blocks", fix="resume it with the same `blocks`")
+        if (out / MODEL_FILE).is_file():
+            raise HyrfError(
+                f"{out}: there is no checkpoint to resume, only a finished model ({MODEL_FILE})",
+                fix="use this model, or replace it by a new run with `overwrite=True` in place of `resume=True`",
+            )
         raise HyrfError(f"{out}: there is no checkpoint to resume", fix="leave out `resume=True` to start a run")
     left = [name for name in (MODEL_FILE, CHECKPOINT_FILE, BLOCKS_JOURNAL_FILE) if (out / name).exists()]
     if left and not (resume or overwrite or record is not None):

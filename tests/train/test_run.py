@@ -184,6 +184,13 @@ def test_resuming_without_a_checkpoint_is_a_clear_error(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+def test_resuming_a_finished_run_says_that_its_model_is_there(tmp_path):
+    (tmp_path / "model.hyrf").write_bytes(b"finished")
+    with pytest.raises(HyrfError, match=r"only a finished model \(model.hyrf\); use this model"):
+        train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, context=QUIET_CONTEXT)
+    assert (tmp_path / "model.hyrf").read_bytes() == b"finished"
+
+
 def test_the_trainer_is_freed_before_the_curve_is_drawn(tmp_path, monkeypatch):
     """matplotlib keeps the frames of its callers in reference cycles, with all that they still hold."""
     trainers: set[weakref.ref] = set()
