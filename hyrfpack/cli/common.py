@@ -32,8 +32,8 @@ overwrite_option = click.option(
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the results as one JSON object.")
 
-# Names of the parameters that `scene_options` adds.
-_READER_OPTIONS = ("test_every", "images", "max_size", "layout", "colmap_model")
+# Names of the parameters that need --data: those that `scene_options` adds, and that of `split_option`.
+_PHOTO_OPTIONS = ("test_every", "images", "max_size", "layout", "colmap_model", "split")
 
 
 def scene_options(command: Command) -> Command:
@@ -54,7 +54,7 @@ def scene_options(command: Command) -> Command:
         **others: Any,
     ) -> Any:
         if not others["data"]:
-            _refuse_reader_options(click.get_current_context())
+            _refuse_photo_options(click.get_current_context())
         reader_options = {"test_every": test_every, "images": images, "max_size": max_size, "layout": layout}
         return command(*args, reader_options={**reader_options, "model": colmap_model}, **others)
 
@@ -94,10 +94,10 @@ def is_given(context: click.Context, parameter: click.Parameter) -> bool:
     return context.get_parameter_source(str(parameter.name)) is ParameterSource.COMMANDLINE
 
 
-def _refuse_reader_options(context: click.Context) -> None:
-    """Raise UsageError if an option of `scene_options` was given, for a command that reads no photos."""
+def _refuse_photo_options(context: click.Context) -> None:
+    """Raise UsageError if an option that needs photos was given, for a command that reads none."""
     for option in context.command.params:
-        if option.name in _READER_OPTIONS and is_given(context, option):
+        if option.name in _PHOTO_OPTIONS and is_given(context, option):
             raise click.UsageError(f"{option.opts[0]} is for reading photos; name their folder with --data")
 
 

@@ -511,6 +511,11 @@ def test_options_for_reading_photos_need_the_folder_of_photos(command, option, p
     assert not list(tmp_path.iterdir())
 
 
+def test_render_refuses_split_without_photos(packed, tmp_path):
+    message = refused("render", packed, "-o", tmp_path / "out", "--split", "test")
+    assert message == "Error: --split is for reading photos; name their folder with --data"
+
+
 @pytest.mark.parametrize(
     "words", ["info", "view", "render -o out", "train -o out", "compress -o out.hyrf", "make -o out.html"]
 )
