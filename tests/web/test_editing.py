@@ -293,7 +293,9 @@ def test_a_saved_file_holds_the_gaussians_that_the_picture_shows(browser: Browse
     click(browser, "#edit-download")
     wait_until(browser, "Boolean(window.saved)")
 
-    (tmp_path / "saved.hyrf").write_bytes(read_saved_bytes(browser))
+    data = read_saved_bytes(browser)
+    assert f"edited.hyrf, {len(data) / 1e3:.0f} kB." in read_text(browser, "toast")
+    (tmp_path / "saved.hyrf").write_bytes(data)
     saved = load_model(tmp_path / "saved.hyrf")
     positions = TURNED_FRAME.to_world(model.gaussians.positions.detach().numpy())
     inside = ((positions >= action["value"][:3]) & (positions <= action["value"][3:])).all(1)
@@ -326,6 +328,7 @@ def test_the_distance_of_two_picked_points_is_that_of_the_world(browser: Browser
     number, unit = read_text(browser, "edit-distance").split()
     assert float(number) == pytest.approx(distance, rel=0.01) and unit == "units"
 
+    assert browser.evaluate("document.getElementById('edit-rescale').disabled"), "there is no length to scale to"
     fill(browser, "#edit-length", 10)
     click(browser, "#edit-rescale")
     (action,) = list_actions(browser)

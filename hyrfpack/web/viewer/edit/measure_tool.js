@@ -15,13 +15,21 @@ export class MeasureTool {
       this.picker.clear();
       editor.refresh();
     };
-    element("edit-rescale").onclick = () => this.rescale(element("edit-length").valueAsNumber);
+    element("edit-length").oninput = () => this.refresh();
+    element("edit-rescale").onclick = () => {
+      editor.set([...editor.actions, { option: "scale", value: this.factor }]);
+    };
   }
 
   // The distance in world units after the actions, or null without two points.
   get distance() {
     const { points: [from, to] } = this.picker;
     return to ? this.editor.size * Math.hypot(...sub(to, from)) : null;
+  }
+
+  // The factor that gives the two points the length of the user; NaN or infinite without points or a length.
+  get factor() {
+    return Number((element("edit-length").valueAsNumber / this.distance).toPrecision(FACTOR_DIGITS));
   }
 
   get text() {
@@ -48,14 +56,8 @@ export class MeasureTool {
     this.editor.refresh();
   }
 
-  // Scales the scene so that the two points have a distance.
-  rescale(length) {
-    const { editor, distance } = this, value = Number((length / distance).toPrecision(FACTOR_DIGITS));
-    if (distance && value > 0 && Number.isFinite(value)) editor.set([...editor.actions, { option: "scale", value }]);
-  }
-
   refresh() {
     element("edit-distance").textContent = this.text;
-    element("edit-rescale").disabled = this.distance === null;
+    element("edit-rescale").disabled = !(this.factor > 0 && this.factor < Infinity);
   }
 }

@@ -34,7 +34,7 @@ export class SaveTool {
     const write = async () => writeKept(bytes, await loader.ask({ decode: true }), actions, writer);
     const file = await (keepsGaussians(actions) ? rewriteFile(bytes, actions, writer) : write());
     const name = saveBlob(new Blob([file]), opener.shown.title, "-edited.hyrf");
-    toast(`Saved as ${name}, ${(file.length / 1e6).toFixed(1)} MB.`);
+    toast(`Saved as ${name}, ${(file.length / 1e3).toFixed()} kB.`);
   }
 
   refresh() {
