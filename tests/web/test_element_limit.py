@@ -9,10 +9,10 @@ from web.pages import Browser, wait_until
 from web.site import Site
 
 ELEMENT_COUNT = 20
-MAX_SCENES = 12  # of element_limit.js
-MAX_CONTEXTS = 16  # that Chromium keeps in a page
+MAX_SCENES = 12  # must equal MAX_SCENES in element_limit.js
+CHROMIUM_CONTEXT_LIMIT = 16
 PIXEL_DATA = base64.b64decode("R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7")
-PAGE = """<!DOCTYPE html><link rel="icon" href="data:,">
+PAGE_TEMPLATE = """<!DOCTYPE html><link rel="icon" href="data:,">
 <style>body {{ margin: 0; }} hyrf-viewer {{ height: {height}px; margin-bottom: {gap}px; }}</style>
 <script>
   window.contexts = new Set();
@@ -41,7 +41,7 @@ def open_elements(
 ) -> None:
     element = f'<hyrf-viewer src="cloud.spz" poster="poster.gif" {attributes}></hyrf-viewer>'
     host.files["/poster.gif"] = PIXEL_DATA
-    host.files["/post.html"] = (PAGE.format(height=height, gap=gap) + count * element).encode()
+    host.files["/post.html"] = (PAGE_TEMPLATE.format(height=height, gap=gap) + count * element).encode()
     browser.open(f"{host.address}/post.html")
 
 
@@ -92,7 +92,7 @@ def test_a_visible_element_beyond_the_limit_says_that_it_waits(one_browser: Brow
 
 
 TAKE_CONTEXTS_JS = (
-    f"window.others = Array.from({{ length: {MAX_CONTEXTS} }},"
+    f"window.others = Array.from({{ length: {CHROMIUM_CONTEXT_LIMIT} }},"
     " () => document.createElement('canvas').getContext('webgl2')), 0"
 )
 
