@@ -6,6 +6,7 @@ line and exits with code 2. Any other exception is a bug in hyrfpack and keeps i
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import copy
@@ -140,6 +141,16 @@ def needs_package(task: str) -> Iterator[None]:
         if package is None:
             raise
         raise HyrfError(f"{task} needs {package}", fix=f"run '{install_command(package)}'") from error
+
+
+def suggest_command(*words: object) -> str:
+    """Return a hyrfpack command for a message, in quotes; words with spaces are quoted as in a POSIX shell.
+
+    Example:
+        >>> suggest_command("view", "my ball.hyrf")
+        "'hyrfpack view 'my ball.hyrf''"
+    """
+    return f"'{shlex.join(('hyrfpack', *map(str, words)))}'"
 
 
 def install_command(package: str) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -17,7 +16,7 @@ from hyrfpack.choices import LAYOUTS
 from hyrfpack.cli.console import note, note_if_verbose
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.config.train import TrainConfig
-from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.errors import HyrfDataError, HyrfError, suggest_command
 
 if TYPE_CHECKING:
     import torch
@@ -209,7 +208,7 @@ def resolve_model_file(path: Path) -> Path:
         model = Path(path.stem).with_suffix(".hyrf")
         raise HyrfError(
             f"{path}: these are splats, not a model",
-            fix=f"import it first: 'hyrfpack import {shlex.quote(str(path))} -o {shlex.quote(str(model))}'",
+            fix=f"import it first: {suggest_command('import', path, '-o', model)}",
         )
     return find_model(path)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +21,7 @@ from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import BOX, HARMONICS_DEGREE, INPUT_PATH, OUTPUT
 from hyrfpack.config.export import ExportConfig
 from hyrfpack.counts import format_count
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, suggest_command
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -172,16 +171,15 @@ def _splats_error(source: Path, output: Path, kind: FileKind) -> HyrfError:
     """Return the error that names the right command for splats of another program."""
     from hyrfpack.splats.table import FORMATS
 
-    name = shlex.quote(str(source))
     if kind.ending in FORMATS:
         return HyrfError(
             f"{source}: these are splats, not a model",
-            fix=f"convert them with 'hyrfpack convert {name} {shlex.quote(str(output))}'",
+            fix=f"convert them with {suggest_command('convert', source, output)}",
         )
     return HyrfError(
         f"{source}: only a folder (-o player/) can play splats",
-        fix=f"to write {kind.ending or 'this'}, import them first: 'hyrfpack import {name} -o "
-        f"{shlex.quote(source.with_suffix('.hyrf').name)}'",
+        fix=f"to write {kind.ending or 'this'}, import them first: "
+        f"{suggest_command('import', source, '-o', source.with_suffix('.hyrf').name)}",
     )
 
 

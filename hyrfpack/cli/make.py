@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +23,7 @@ from hyrfpack.cli.settings import reject_two_sizes, settings_options
 from hyrfpack.cli.types import INPUT_PATH, OUTPUT, OUTPUT_FOLDER
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.counts import format_count
+from hyrfpack.errors import suggest_command
 
 if TYPE_CHECKING:
     from hyrfpack.make import MakeResult
@@ -143,6 +143,6 @@ def _viewing_hint(result: MakeResult) -> str:
     if output.suffix.lower() == ".html":
         return "open it in a browser"
     if output.is_dir():
-        return f"for any web server; see it with 'hyrfpack view {shlex.quote(str(result.model))}'"
+        return f"for any web server; see it with {suggest_command('view', result.model)}"
     viewable = output.suffix.lower() in (".hyrf", ".ply", ".splat", ".spz", ".sog") and ".points." not in output.name
-    return f"see it with 'hyrfpack view {shlex.quote(str(output if viewable else result.model))}'"
+    return f"see it with {suggest_command('view', output if viewable else result.model)}"

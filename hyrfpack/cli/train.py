@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +26,7 @@ from hyrfpack.cli.settings import reject_two_sizes, settings_options
 from hyrfpack.cli.types import INPUT_PATH, OUTPUT, OUTPUT_FOLDER
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.counts import format_count
-from hyrfpack.errors import HyrfNoPosesError
+from hyrfpack.errors import HyrfNoPosesError, suggest_command
 
 if TYPE_CHECKING:
     from hyrfpack.parallel.ranks import Ranks
@@ -179,7 +178,7 @@ def train(
             consistent = format_consistent_psnr(scores.get("psnr_consistent"))
             click.echo(f"held-out views: {scores['psnr']:.2f} dB{consistent}, SSIM {scores['ssim']:.4f}")
         if view:
-            note(f"to see the model again, run 'hyrfpack view {shlex.quote(str(result.model))}'")
+            note(f"to see the model again, run {suggest_command('view', result.model)}")
     if not result.complete:
         click.get_current_context().exit(1)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from hyrfpack.data.folder import list_photos, list_raw_photos
 from hyrfpack.data.layouts import LAYOUTS
 from hyrfpack.data.search import find_set
 from hyrfpack.data.unusable import no_photos_error, raise_if_single_photo
-from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
+from hyrfpack.errors import HyrfDataError, HyrfNoPosesError, suggest_command
 from hyrfpack.outputs import VIDEO_SUFFIXES
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 
@@ -190,5 +189,6 @@ def pose_commands(path: str | os.PathLike[str]) -> str:
         >>> pose_commands("a.mp4")
         "'hyrfpack poses a.mp4 -o SCENE' estimates them, and 'hyrfpack make a.mp4 -o scene.html' runs all stages"
     """
-    name = shlex.quote(os.fspath(path))
-    return f"'hyrfpack poses {name} -o SCENE' estimates them, and 'hyrfpack make {name} -o scene.html' runs all stages"
+    poses = suggest_command("poses", os.fspath(path), "-o", "SCENE")
+    make = suggest_command("make", os.fspath(path), "-o", "scene.html")
+    return f"{poses} estimates them, and {make} runs all stages"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
@@ -17,7 +16,7 @@ from hyrfpack.checks import check_type
 from hyrfpack.config.export import ConvertConfig
 from hyrfpack.context import RunContext
 from hyrfpack.counts import format_count
-from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.errors import HyrfDataError, HyrfError, suggest_command
 from hyrfpack.export.kinds import (
     STREAMED_SOG_FOLDER,
     check_package,
@@ -167,7 +166,7 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
         if Path(source).suffix.lower() == ".hyrf":
             raise HyrfError(
                 f"{source}: this is a model, not splats",
-                fix=f"write it with 'hyrfpack export {shlex.quote(str(source))} -o {shlex.quote(str(target))}'",
+                fix=f"write it with {suggest_command('export', source, '-o', target)}",
             )
         if (Path(source) / STREAMED_SOG_FOLDER.ending).is_file():
             raise HyrfError(
@@ -181,7 +180,7 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
     if Path(target).suffix.lower() == ".hyrf":
         raise HyrfError(
             f"{target}: splats are imported as a model, not converted",
-            fix=f"run 'hyrfpack import {shlex.quote(str(source))} -o {shlex.quote(str(target))}'",
+            fix=f"run {suggest_command('import', source, '-o', target)}",
         )
     kind = find_kind_by_ending(target)
     if not isinstance(kind, SplatFormat):

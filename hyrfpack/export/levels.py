@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import os
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hyrfpack.config.export import ExportConfig
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, suggest_command
 from hyrfpack.export.baked_scene import BakedScene, bake_scene
 from hyrfpack.export.source import Source
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
@@ -78,8 +77,7 @@ def open_levels(source: str | os.PathLike[str]) -> SceneFolder:
     if not is_scene(source):
         raise HyrfError(
             f"{source}: this model has no levels of detail to stream",
-            fix=f"split it first with 'hyrfpack split {shlex.quote(str(source))} -o scene', "
-            "and export the folder 'scene'",
+            fix=f"split it first with {suggest_command('split', source, '-o', 'scene')}, and export the folder 'scene'",
         )
     return SceneFolder(source)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import shlex
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ from hyrfpack.counts import format_count
 from hyrfpack.data.folder import PhotoFacts
 from hyrfpack.data.quality import MIN_SHARPNESS
 from hyrfpack.data.unusable import format_file_names
+from hyrfpack.errors import suggest_command
 from hyrfpack.outputs import PICTURE_SUFFIXES
 from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
@@ -42,7 +42,7 @@ def find_count_problems(count: int, scene: Scene | None, posed: int, path: Path)
         unused = format_count(without, f"{of_photos} has no pose and is", f"{of_photos} have no pose and are")
         found.append(
             f"{unused} not used; take more photos between them and the others, or estimate all poses again with "
-            f"'hyrfpack poses {shlex.quote(str(path))} -o SCENE'"
+            f"{suggest_command('poses', path, '-o', 'SCENE')}"
         )
     if not len(scene.points):
         found.append(

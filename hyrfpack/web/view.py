@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Callable
 from pathlib import Path
 
-from hyrfpack.errors import HyrfDataError
+from hyrfpack.errors import HyrfDataError, suggest_command
 from hyrfpack.format import describe_file, find_model
 from hyrfpack.format.run_folder import name_model
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
@@ -82,7 +81,7 @@ def find_playable_file(path: str | os.PathLike[str]) -> Path:
     if sog_folder(path) is not None:
         raise HyrfDataError(
             f"{path}: a page plays single files",
-            fix=f"bundle these with 'hyrfpack convert {shlex.quote(str(path))} scene.sog'",
+            fix=f"bundle these with {suggest_command('convert', path, 'scene.sog')}",
         )
     return Path(path)
 
