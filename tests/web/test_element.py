@@ -126,6 +126,30 @@ def test_an_element_switches_between_page_and_frame(browser: Browser, host: Site
     assert browser.evaluate(f"!{ELEMENT_JS}.shadowRoot.querySelector('iframe') && {ELEMENT_JS}.viewer.isReady")
 
 
+def test_a_frame_follows_the_camera_without_entries_in_the_history(browser: Browser, host: Site):
+    open_element(browser, host, 'src="cloud.spz" camera="0,0,3,0,0,0,0,1,0" frame')
+    wait_until(browser, LOADED_JS)
+    frame = f"{ELEMENT_JS}.shadowRoot.querySelector('iframe')"
+    browser.evaluate(f"window.entries = history.length, window.first = {frame}, 0")
+    for x in (1, 2):
+        browser.evaluate(f"{ELEMENT_JS}.setAttribute('camera', '{x},0,3,0,0,0,0,1,0')")
+        wait_until(browser, f"{frame}.contentWindow.location.hash.startsWith('#camera={x},')")
+    assert browser.evaluate(f"{frame} === first && history.length === entries")
+    browser.evaluate(f"window.element = {ELEMENT_JS}, element.remove(), fired.length = 0")
+    browser.evaluate("new Promise((done) => setTimeout(done, 50))")
+    browser.evaluate("document.body.append(element)")
+    wait_until(browser, LOADED_JS)
+    assert browser.evaluate(f"{frame}.contentWindow.location.hash").startswith("#camera=2,")
+    browser.evaluate("window.main = document.createElement('main'), document.body.append(main), fired.length = 0")
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('camera', '3,0,3,0,0,0,0,1,0')")
+    wait_until(browser, f"{frame}.contentWindow.location.hash.startsWith('#camera=3,')")
+    browser.evaluate("main.append(element)")  # which loads the frame again
+    wait_until(browser, f"{LOADED_JS} && {frame}.contentWindow.location.hash.startsWith('#camera=3,')")
+    browser.evaluate(f"fired.length = 0, {ELEMENT_JS}.setAttribute('src', 'other.spz')")
+    wait_until(browser, "fired.length > 0")
+    assert browser.evaluate("history.length === entries")
+
+
 def test_an_element_without_src_shows_nothing_and_waits(browser: Browser, host: Site):
     open_element(browser, host, "")
     browser.evaluate("new Promise((done) => setTimeout(done, 50))")

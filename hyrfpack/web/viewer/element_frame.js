@@ -8,25 +8,23 @@ export const FRAME_ATTRIBUTES = ["src", "camera", "poster", "title", "exposure",
 const ANSWER_MS = 3000; // a player answers long before its page has loaded
 const FIX_TEXT = 'set its attribute player to the address of the player, such as player="player/index.html".';
 
+const withoutHash = (address) => address.split("#")[0];
+
 export class FrameView {
   constructor(element) {
     this.element = element;
-    this.frame = document.createElement("iframe");
-    this.frame.allow = "fullscreen; clipboard-write; web-share";
-    this.frame.onload = () => {
-      if (!this.isAnswered) this.timer = setTimeout(() => this.fail(this.noPlayerText()), ANSWER_MS);
-    };
+    this.frame = null;
+    this.address = "";
     this.receiveMessage = this.receiveMessage.bind(this);
     addEventListener("message", this.receiveMessage);
   }
 
   dispose() {
     removeEventListener("message", this.receiveMessage);
-    clearTimeout(this.timer);
-    this.frame.remove();
+    this.removeFrame();
   }
 
-  // Follows the element's attributes. A new camera changes only what follows "#", so that the frame is not reloaded.
+  // Follows the element's attributes.
   update() {
     const { element } = this, player = element.getAttribute("player") || addressBesideScript("index.html");
     let address;
@@ -50,25 +48,46 @@ export class FrameView {
       if (element.hasAttribute(name)) address.searchParams.set(name, "");
     }
     if (element.hasAttribute("camera")) address.hash = `camera=${element.getAttribute("camera")}`;
+    this.show(address);
     this.frame.title = element.title || "3D scene";
-    if (this.frame.src === address.href) return;
-    if (this.frame.src.split("#")[0] !== address.href.split("#")[0]) {
-      this.isAnswered = false;
-      clearTimeout(this.timer);
-    }
-    this.frame.src = address;
-    // Added only now, so that no empty page loads before, and only once, because moving a frame reloads it.
-    if (!this.frame.isConnected) element.shadowRoot.append(this.frame);
+  }
+
+  // Shows an address. A new camera changes only what follows "#", so the frame is not reloaded. It replaces the last
+  // one, and another scene is shown in a new frame, because a new `src` would add an entry to the browser's history.
+  show({ href, hash }) {
+    const before = this.address;
+    this.address = href;
+    if (href === before) return;
+    if (hash && withoutHash(href) === withoutHash(before)) return this.turn();
+    this.removeFrame();
+    this.isAnswered = false;
+    this.frame = document.createElement("iframe");
+    this.frame.allow = "fullscreen; clipboard-write; web-share";
+    this.frame.src = href;
+    this.frame.onload = () => {
+      if (this.frame.src !== this.address) this.turn(); // to the newest camera, after an element was moved in its page
+      if (!this.isAnswered) this.timer = setTimeout(() => this.fail(this.noPlayerText()), ANSWER_MS);
+    };
+    this.element.shadowRoot.append(this.frame);
+  }
+
+  turn() {
+    this.frame.contentWindow.location.replace(this.address);
+  }
+
+  removeFrame() {
+    clearTimeout(this.timer);
+    this.frame?.remove();
   }
 
   noPlayerText() {
-    const address = this.frame.src.split(/[?#]/)[0];
+    const address = this.address.split(/[?#]/)[0];
     return `${address} is no player, or is not allowed to run here; ${FIX_TEXT}`;
   }
 
   // Passes on the events of the player in the frame.
   receiveMessage({ source, data }) {
-    if (source !== this.frame.contentWindow || !data?.hyrf) return;
+    if (source !== this.frame?.contentWindow || !data?.hyrf) return;
     this.isAnswered = true;
     clearTimeout(this.timer);
     if (["load", "error"].includes(data.hyrf)) this.element.fireEvent(data.hyrf, String(data.message ?? ""));
