@@ -17,7 +17,8 @@ from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.cli.drawing import Drawing
-    from hyrfpack.evaluate import Evaluation, ViewScore
+    from hyrfpack.evaluate import Evaluation
+    from hyrfpack.evaluate.view_scores import ViewScore
     from hyrfpack.model import HybridModel
     from hyrfpack.model.merged import MergedModel
     from hyrfpack.scene import Scene, View

@@ -4,52 +4,34 @@ from __future__ import annotations
 
 import os
 import statistics
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from hyrfpack.checks import check_type
-from hyrfpack.choices import AS_PHOTOGRAPHED, CONSISTENT_EXPOSURE
 from hyrfpack.counts import format_count
-from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate.exposure import correct_colors
-from hyrfpack.evaluate.figures import draw_comparison
 from hyrfpack.evaluate.lpips import LPIPS
-from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
+from hyrfpack.evaluate.view_scores import ViewScore, ViewScorer
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
-from hyrfpack.model.merged import MergedModel, scene_of
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
-from hyrfpack.render import RenderSettings, apply_exposure_map, render_view
+from hyrfpack.render import RenderSettings
 from hyrfpack.render.files import save_picture, unique_stems
-from hyrfpack.scene import Camera, View, evenly_spaced
-from hyrfpack.splats.draw import Drawable, draw
+from hyrfpack.scene import View, evenly_spaced
+from hyrfpack.splats.draw import Drawable
 
 DEFAULT_PICTURE_COUNT = 6
 NO_LPIPS_REASON = (
     "no weights: LPIPS needs the trained network of the lpips package; "
     'pass a file made by torch.save(lpips.LPIPS(net="alex").state_dict(), FILE)'
 )
-
-
-@dataclass(frozen=True)
-class ViewScore:
-    """Scores of one held-out view; the quantities are those of `Evaluation`."""
-
-    name: str
-    psnr: float
-    psnr_consistent: float | None
-    psnr_corrected: float
-    ssim: float
-    lpips: float | None
 
 
 @dataclass(frozen=True)
@@ -144,47 +126,25 @@ def evaluate_model(
     if not views:
         raise HyrfError("there is no view to score", fix="name a split that has photos or a smaller `test_every`")
     perceptual = None if lpips_weights is None else LPIPS.load(lpips_weights)
-    if isinstance(model, Drawable):
-        solid, device, count = np.zeros(3, np.float32), model.device, len(model.positions)
-    else:
-        scene, count = scene_of(model), len(model)
-        solid, device = np.array(scene.config.solid, dtype=np.float32), scene.gaussians.positions.device
     pictures_to_write = picture_names(views, picture_count)
 
     def score_own_views() -> list[tuple[int, ViewScore | None, float]]:
         """Return index, score (None if the mask leaves no pixel) and render seconds of each view of this rank."""
-        draw_colors = _color_renderer(model, settings)
-        draw_colors(views[0].camera)  # warm-up: compiles kernels and fills caches
+        scorer = ViewScorer(model, settings, perceptual)
+        scorer.warm_up(views[0].camera)
         scores: list[tuple[int, ViewScore | None, float]] = []
         own = ranks.share(list(enumerate(views)))
         for done, (number, view) in enumerate(own):
             progress(TaskEvent(f"scoring photo {done + 1}/{len(own)}", done / len(own)))
-            photo = view.load()
-            reference, mask = upload(photo, solid, device)
-            if mask is not None and not mask.any():
+            comparison = scorer.compare(view)
+            if comparison is None:
                 scores.append((number, None, 0.0))
                 continue
-            started = _synchronized_seconds(device)
-            rgb, consistent = draw_colors(view.camera)
-            seconds = _synchronized_seconds(device) - started
-            image = to_8bit(rgb)
-            distance = None
-            if perceptual is not None:
-                unmasked = image if mask is None else torch.where(mask[..., None], image, reference)
-                distance = perceptual(unmasked, reference)
-            score = ViewScore(
-                name=view.name,
-                psnr=psnr(image, reference, mask),
-                psnr_consistent=None if consistent is None else psnr(to_8bit(consistent), reference, mask),
-                psnr_corrected=psnr(correct_colors(image, reference, mask), reference, mask),
-                ssim=ssim(image, reference, mask),
-                lpips=distance,
-            )
-            scores.append((number, score, seconds))
+            scores.append((number, comparison.score, comparison.seconds))
             if pictures is not None and number in pictures_to_write:
-                sheet = draw_comparison(reference, image, mask, _caption(score))
+                file = Path(pictures, pictures_to_write[number])
                 try:
-                    save_picture(Path(pictures, pictures_to_write[number]), sheet, overwrite=overwrite, rename=False)
+                    save_picture(file, comparison.draw(), overwrite=overwrite, rename=False)
                 except HyrfError as error:
                     if unwritten is None:
                         raise
@@ -205,35 +165,11 @@ def evaluate_model(
         ssim=statistics.fmean(score.ssim for score in scores),
         lpips=_mean(score.lpips for score in scores),
         lpips_reason=NO_LPIPS_REASON if perceptual is None else f"network {perceptual.name}",
-        gaussians=count,
+        gaussians=len(model.positions) if isinstance(model, Drawable) else len(model),
         seconds_per_frame=statistics.median(seconds for _, score, seconds in all_rows if score is not None),
         views=scores,
         skipped=[views[number].name for number, score, _ in all_rows if score is None],
     )
-
-
-def _color_renderer(
-    model: HybridModel | MergedModel | Drawable, settings: RenderSettings
-) -> Callable[[Camera], tuple[torch.Tensor, torch.Tensor | None]]:
-    """Return a function that renders a camera: (H, W, 3) as `settings` ask, and (H, W, 3) at the consistent exposure.
-
-    The second is None for splats, merged models and models without an exposure map. Everything that does not depend on
-    the view is decoded once.
-    """
-    if isinstance(model, Drawable):
-        return lambda camera: (draw(model, camera, settings).rgb, None)
-    if isinstance(model, MergedModel):
-        parts = model.decode()
-        return lambda camera: (render_view(model, camera, settings, decoded=parts).rgb, None)
-    decoded, at_one_exposure = model.decode(), replace(settings, exposure=CONSISTENT_EXPOSURE)
-
-    def draw_colors(camera: Camera) -> tuple[torch.Tensor, torch.Tensor | None]:
-        rgb = render_view(model, camera, at_one_exposure, decoded=decoded).rgb
-        if model.exposure is None:
-            return rgb, None
-        return apply_exposure_map(model, camera, rgb) if settings.exposure == AS_PHOTOGRAPHED else rgb, rgb
-
-    return draw_colors
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
@@ -246,14 +182,3 @@ def picture_names(views: Sequence[View], count: int = DEFAULT_PICTURE_COUNT) -> 
     """Return the names of the pictures that `evaluate` writes, by the index of their view."""
     names = unique_stems([view.name for view in views])
     return {index: f"{names[index]}.png" for index in evenly_spaced(range(len(views)), count)}
-
-
-def _caption(score: ViewScore) -> str:
-    perceptual = "" if score.lpips is None else f"   LPIPS {score.lpips:.3f}"
-    return f"{score.name}   {score.psnr:.2f} dB   SSIM {score.ssim:.3f}{perceptual}"
-
-
-def _synchronized_seconds(device: torch.device) -> float:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()

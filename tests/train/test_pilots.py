@@ -15,7 +15,8 @@ from scenes import QUIET_CONTEXT, ball_scene
 from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
-from hyrfpack.evaluate import Evaluation, ViewScore
+from hyrfpack.evaluate import Evaluation
+from hyrfpack.evaluate.view_scores import ViewScore
 from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.progress import Event, StepEvent, TaskEvent
