@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from hyrfpack.cli.drawing import Drawing
-    from hyrfpack.render import RenderedPicture
+    from hyrfpack.cli.render_source import RenderSource
+    from hyrfpack.lod import LevelRenderer
+    from hyrfpack.render import RenderedPicture, RenderSettings
     from hyrfpack.scene import Camera
 
 DEFAULT_ORBIT_FRAMES = 60
@@ -114,14 +116,11 @@ def render(
     if gaussians is not None and level_bytes is not None:
         raise click.UsageError("--gaussians and --bytes each limit what a view draws; give one of them")
     from hyrfpack.atomic import write_atomic
-    from hyrfpack.cameras.files import cameras_from_json, cameras_to_json
-    from hyrfpack.cameras.paths import orbit as orbit_around
+    from hyrfpack.cameras.files import cameras_to_json
     from hyrfpack.lock import exclusive_folder
-    from hyrfpack.measure.psnr import psnr_from_mse
-    from hyrfpack.render.files import make_renderer, render_file_names, unique_stems, write_pictures
+    from hyrfpack.render.files import render_file_names, unique_stems, write_pictures
     from hyrfpack.render.geometry_files import GeometryWriter
     from hyrfpack.render.video import has_ffmpeg, write_video
-    from hyrfpack.splats.draw import Drawable, draw_picture
 
     ranks, settings = drawing.ranks, drawing.settings
     geometry = GeometryConfig(depth, normals, depth_unit)
@@ -131,13 +130,9 @@ def render(
     levels = source.load_levels(gaussians, level_bytes) if has_budget else None
     if data is not None:
         scene = ranks.run_on_all(lambda: read_scene(data, reader_options, source.facts))
-        views = select_views(scene, split)
-        named = [(view.name, view.camera) for view in views]
-    elif cameras is not None:
-        named = cameras_from_json(cameras)
+        named = [(view.name, view.camera) for view in select_views(scene, split)]
     else:
-        cameras_around = orbit_around(source.viewpoint, orbit or DEFAULT_ORBIT_FRAMES)
-        named = [(f"{number:04d}", camera) for number, camera in enumerate(cameras_around)]
+        named = _name_cameras(source, cameras, orbit or DEFAULT_ORBIT_FRAMES)
     video_path = output / "video.mp4" if video and has_ffmpeg() else None
     if video and not video_path:
         note("ffmpeg was not found, so only pictures are written; install the ffmpeg program for a video")
@@ -151,13 +146,7 @@ def render(
             outputs.folder(output, names)
 
     def write() -> tuple[list[Path], float]:
-        picture_of: Callable[[Camera], RenderedPicture]
-        if levels is not None:
-            picture_of = partial(levels.draw, settings=settings, geometry=geometry)
-        elif isinstance(shown := source.load(), Drawable):
-            picture_of = partial(draw_picture, shown, settings=settings, geometry=geometry)
-        else:
-            picture_of = make_renderer(shown, geometry=geometry, settings=settings)
+        picture_of = _picture_renderer(source, levels, settings, geometry)
         pictures = write_pictures(picture_of, named, output, geometry=writer, overwrite=overwrite, ranks=ranks)
         count, written = len(ranks.share(named)), []
         try:
@@ -187,11 +176,7 @@ def render(
         if video_path:
             video_path = note_rename(video_path, write_video(written, video_path, overwrite=overwrite))
     if levels is not None and levels.choices:
-        counts = [choice.gaussians for choice in levels.choices]
-        predicted = fmean(psnr_from_mse(choice.predicted_mse) for choice in levels.choices)
-        note(
-            f"views have {min(counts):,} to {max(counts):,} Gaussians; predicted PSNR to the finest {predicted:.1f} dB"
-        )
+        _note_levels(levels)
     for name, path in zip(render_file_names([name for name, _ in named]), written, strict=True):
         note_rename(output / name, path)
     if as_json:
@@ -201,3 +186,37 @@ def render(
         kinds = " and ".join(kind for kind, extension in (("depth", depth), ("normals", normals)) if extension)
         pictures = f"{format_count(len(written), 'picture')}{film}, {width} x {height} pixels"
         click.echo(f"{output}: {pictures}{kinds and f', with {kinds}'}")
+
+
+def _name_cameras(source: RenderSource, cameras: Path | None, frames: int) -> list[tuple[str, Camera]]:
+    """Return the cameras of a file, or else those of an orbit around the scene, with their names."""
+    from hyrfpack.cameras.files import cameras_from_json
+    from hyrfpack.cameras.paths import orbit
+
+    if cameras is not None:
+        return cameras_from_json(cameras)
+    return [(f"{number:04d}", camera) for number, camera in enumerate(orbit(source.viewpoint, frames))]
+
+
+def _picture_renderer(
+    source: RenderSource, levels: LevelRenderer | None, settings: RenderSettings, geometry: GeometryConfig
+) -> Callable[[Camera], RenderedPicture]:
+    """Return a function that renders a camera: from levels of detail if they are given, else from the whole source."""
+    from hyrfpack.render.files import make_renderer
+    from hyrfpack.splats.draw import Drawable, draw_picture
+
+    if levels is not None:
+        return partial(levels.draw, settings=settings, geometry=geometry)
+    shown = source.load()
+    if isinstance(shown, Drawable):
+        return partial(draw_picture, shown, settings=settings, geometry=geometry)
+    return make_renderer(shown, geometry=geometry, settings=settings)
+
+
+def _note_levels(levels: LevelRenderer) -> None:
+    """Say how many Gaussians the views have, and how well they match the finest levels."""
+    from hyrfpack.measure.psnr import psnr_from_mse
+
+    counts = [choice.gaussians for choice in levels.choices]
+    predicted = fmean(psnr_from_mse(choice.predicted_mse) for choice in levels.choices)
+    note(f"views have {min(counts):,} to {max(counts):,} Gaussians; predicted PSNR to the finest {predicted:.1f} dB")
