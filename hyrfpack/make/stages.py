@@ -322,7 +322,10 @@ def copy_to_output(product: Path, output: Path, *, overwrite: bool) -> Path:
         return copy_if_different(product, output, overwrite=overwrite)
     files = {path: output / path.relative_to(product) for path in sorted(product.rglob("*")) if path.is_file()}
     different = [target for path, target in files.items() if file_digest(path) != file_digest(target)]
-    Outputs(overwrite=overwrite).folder(output, [os.path.relpath(target, output) for target in different])
+    # The poster of a copy that an earlier call has begun is not a photo of the user.
+    is_begun = len(different) < len(files)
+    if not is_begun or any(map(os.path.lexists, different)):
+        Outputs(overwrite=overwrite).folder(output, [os.path.relpath(target, output) for target in different])
     for path, target in files.items():
         copy_if_different(path, target, overwrite=overwrite, rename=False)
     return output

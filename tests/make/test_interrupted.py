@@ -94,12 +94,13 @@ def test_an_interrupted_estimation_of_poses_resumes(photos, poses, tmp_path, mon
     assert make_scene(photos, tmp_path / "scene.ply", MakeConfig(quality="draft")).kept[0] == "poses"
 
 
-def test_a_partly_copied_output_is_completed(posed, tmp_path, monkeypatch):
+@pytest.mark.parametrize("copied", [2, 7])  # 7 are all but the scene, with the poster
+def test_a_partly_copied_output_is_completed(copied, posed, tmp_path, monkeypatch):
     usual, copies = stages.copy_if_different, []
 
     def stop(source, target, **options):
         copies.append(target)
-        if len(copies) == 3:
+        if len(copies) > copied:
             raise KeyboardInterrupt
         usual(source, target, **options)
 
@@ -107,10 +108,18 @@ def test_a_partly_copied_output_is_completed(posed, tmp_path, monkeypatch):
         patch.setattr(stages, "copy_if_different", stop)
         with pytest.raises(Stopped):
             make_scene(posed, tmp_path / "player", MakeConfig(quality="draft"))
-    assert len(list((tmp_path / "player").iterdir())) == 2
+    assert len(list((tmp_path / "player").iterdir())) == copied
     completed = make_scene(posed, tmp_path / "player", MakeConfig(quality="draft")).output
     undisturbed = make_scene(posed, tmp_path / "other", MakeConfig(quality="draft")).output
     assert {path.name for path in completed.iterdir()} == {path.name for path in undisturbed.iterdir()}
+
+
+def test_a_finished_folder_stays_as_it_is_when_the_call_is_repeated(finished_work, posed, tmp_path):
+    output = make_scene(posed, tmp_path / "player", work=finished_work).output
+    before = {path.name: path.stat().st_mtime_ns for path in output.iterdir()}
+    assert "poster.jpg" in before
+    assert make_scene(posed, output, work=finished_work).kept[-1] == "export"
+    assert {path.name: path.stat().st_mtime_ns for path in output.iterdir()} == before
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
