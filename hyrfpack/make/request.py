@@ -126,6 +126,11 @@ class Request:
         self._check_target()
         if source.kind == "photos" and not list_photos(source.path):
             raise HyrfDataError(f"{source.path}: there is no photo in this folder", fix="name one that has some")
+        if source.scene is None and self.config.test_every == 1:  # with poses, reading the photos says so
+            raise HyrfDataError(
+                f"{source.path}: each photo would be held out, and none is left to train on",
+                fix="hold out fewer with `test_every` (0 holds out none)",
+            )
 
     def _check_target(self) -> None:
         """Reject a target size that no file of these photos can have; photos without poses get a weaker check."""

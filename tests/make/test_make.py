@@ -318,6 +318,7 @@ def test_impossible_requests_are_rejected_before_any_work(posed, photos, finishe
         ("lie in each other", posed, "-o", tmp_path / "work" / "a.html", "--work", tmp_path / "work"),
         ("holds other files", posed, "-o", out, "--work", tmp_path / "full"),
         ("the folder is empty", tmp_path / "empty", "-o", out),
+        ("none is left to train on; hold out fewer with --test-every", photos, "-o", out, "--test-every", 1),
         ("but clip.mp4; name the video", tmp_path / "videos", "-o", out),
         ("is a .hyrf file already", finished_work / "model.hyrf", "-o", tmp_path / "a.hyrf"),
         ("with photos only", finished_work / "model.hyrf", "-o", out, "--minutes", 3),
