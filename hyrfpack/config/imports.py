@@ -40,3 +40,8 @@ class ImportConfig:
                 "a target size and a PSNR of the worst view each decide how large the file is",
                 fix="give one of `target_bytes` and `worst`",
             )
+        if self.psnr != ImportConfig.psnr and self.target_bytes is not None:
+            raise HyrfError(
+                "a target size and a PSNR each decide how large the file is",
+                fix="give one of `target_bytes` and `psnr`",
+            )

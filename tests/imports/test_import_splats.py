@@ -240,6 +240,12 @@ def test_settings_out_of_range_are_rejected() -> None:
             ImportConfig(**wrong)
 
 
+@pytest.mark.parametrize("name", ["psnr", "worst"])
+def test_a_target_size_excludes_targets_of_psnr(name: str) -> None:
+    with pytest.raises(HyrfError, match=f"decide how large the file is; give one of `target_bytes` and `{name}`"):
+        ImportConfig(target_bytes=20_000, **{name: 40.0})
+
+
 def test_reference_views_hold_the_drawn_pictures() -> None:
     splats = ball_splats(40)
     weighted = WeightedSplats.from_splats(splats, "ball")
