@@ -60,15 +60,13 @@ def encode_within_bytes(
         _LOG.info(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes")
         return candidate
 
-    answer = find_fullest(
+    distortion, candidate = find_fullest(
         encode_candidate, lambda candidate: len(candidate.data), limit, start, trials, DISTORTION_RANGE
     )
-    # Trials may run out before the largest distortion.
-    distortion, candidate = answer or (DISTORTION_RANGE[1], encode_candidate(DISTORTION_RANGE[1]))
     if (smallest := len(candidate.data)) > limit:
         raise HyrfSizeError(
             f"the model does not fit into {limit:,} bytes, and the smallest possible size is about {smallest:,} bytes",
-            fix="use a larger target size, or train with fewer Gaussians (`max_gaussians`)",
+            fix="use a larger `target_bytes`, or train with fewer Gaussians (`max_gaussians`)",
             min_bytes=smallest,
         )
     return candidate, f"distortion {distortion:.2g} gives {len(candidate.data):,} of {limit:,} bytes"

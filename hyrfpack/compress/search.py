@@ -74,7 +74,7 @@ def find_fullest(
     start: float,
     trials: int,
     bounds: tuple[float, float],
-) -> tuple[float, Trial] | None:
+) -> tuple[float, Trial]:
     """Find a distortion whose trial takes at most `limit` bytes and at least ACCEPTED_SIZE_RATIO of them.
 
     The size falls roughly as a power of the distortion. The next distortion is found by interpolation through the last
@@ -86,11 +86,13 @@ def find_fullest(
         make_trial, start, trials, bounds: as for `find_coarsest`.
 
     Returns:
-        The distortion and the largest trial that fits; None if none does.
+        The distortion and the largest trial that fits; if none does, the largest distortion and its trial.
     """
+    largest = bounds[1]
     bounds = math.log(bounds[0]), math.log(bounds[1])
     wanted, place = math.log(TARGET_SIZE_RATIO * limit), min(max(_log(start), bounds[0]), bounds[1])
     best: tuple[float, Trial] | None = None
+    trial: Trial | None = None
     # The pairs are logarithms of a distortion and of its bytes: for the smallest distortion that fits, for the largest
     # that does not fit, and for each trial.
     fitting: tuple[float, float] | None = None
@@ -120,7 +122,10 @@ def find_fullest(
                 else min(max(place, low + edge), high - edge)
             )
         place = min(max(place, low), high)
-    return best
+    if best is not None:
+        return best
+    is_largest = too_large is not None and too_large[0] >= bounds[1]
+    return largest, trial if is_largest and trial is not None else make_trial(largest)
 
 
 def _interpolate(measured: list[tuple[float, float]], wanted: float) -> float:

@@ -70,7 +70,7 @@ def check_target_bytes(target_bytes: int, provenance: dict | None = None, exposu
     unit = (
         "MB" if target_bytes < MEGABYTE_HINT_BELOW_BYTES else "kB" if target_bytes < KILOBYTE_HINT_BELOW_BYTES else None
     )
-    remedy = f"did you mean {target_bytes}{unit}?" if unit else "ask for more"
+    remedy = f"did you mean {target_bytes}{unit}?" if unit else f"use a `target_bytes` of at least {smallest:,}"
     raise HyrfError(
         f"a target size of {target_bytes:,} bytes is below the smallest possible file, about {smallest:,} bytes",
         fix=remedy,

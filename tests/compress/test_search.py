@@ -135,12 +135,14 @@ def test_the_search_returns_the_largest_fitting_trial(limit, slope, jump, start)
     answer = find_fullest(recorded, size, limit, start, 9, DISTORTION_RANGE)
 
     fitting = [noise for noise in recorded.made if size(noise) <= limit]
-    assert len(recorded.made) <= 9 and all(
+    assert len(recorded.made) <= 10 and all(
         0.99 * DISTORTION_RANGE[0] < noise < 1.01 * DISTORTION_RANGE[1] for noise in recorded.made
     )
-    assert answer == ((min(fitting),) * 2 if fitting else None)
-    if not fitting and len(recorded.made) < 9:
-        assert max(recorded.made) == pytest.approx(DISTORTION_RANGE[1])
+    if fitting:
+        assert answer == (min(fitting),) * 2
+    else:
+        assert answer == (DISTORTION_RANGE[1], recorded.made[-1])
+        assert [noise for noise in recorded.made if noise > 0.99 * DISTORTION_RANGE[1]] == recorded.made[-1:]
 
 
 def test_a_jump_in_the_sizes_ends_the_search():

@@ -52,7 +52,7 @@ def test_a_target_below_the_bound_is_refused_with_a_hint_at_a_missing_unit(size,
 
 
 def test_an_exact_target_below_the_bound_is_refused_without_a_hint(tiny_file_and_provenance):
-    with pytest.raises(HyrfError, match="of 1,000 bytes .*; ask for more"):
+    with pytest.raises(HyrfError, match="of 1,000 bytes .*; use a `target_bytes` of at least "):
         check_target_bytes(1_000, tiny_file_and_provenance[1])
 
 
