@@ -98,7 +98,7 @@ class Packer:
         quantized = quantize(planned, plan, self.sensitivity, reach=reach)
         progress(TaskEvent("entropy coding", 0.95 if steps else 0.6))
         data = encode_model(planned, "compact", self.provenance, quantized=quantized)
-        return EncodedCandidate(data, predict_errors(self.model, planned, quantized, self.sensitivity))
+        return EncodedCandidate(data, predict_errors(planned, quantized, self.sensitivity))
 
     def encode_to_distortion(
         self, target: float, references: ReferenceRenders, target_drop: float | None = None
@@ -120,7 +120,8 @@ class Packer:
             before = evaluate_model(self.model, views, progress=part_of_progress(self.progress, 0.3, 0.6)).psnr
             for number in range(MAX_CORRECTIONS):
                 progress = round_of_progress(part_of_progress(self.progress, 0.6, 1.0), number)
-                psnr_drop = before - evaluate_model(self.decode(candidate), views, progress=progress).psnr
+                scoring, encoding = part_of_progress(progress, 0.0, 0.5), part_of_progress(progress, 0.5, 1.0)
+                psnr_drop = before - evaluate_model(self.decode(candidate), views, progress=scoring).psnr
                 if psnr_drop <= PSNR_DROP_TOLERANCE_RATIO * target_drop:
                     break
                 distortion *= max(target_drop / psnr_drop, 1 / MAX_REFINING_RATIO)
@@ -128,7 +129,7 @@ class Packer:
                     f"training photos lose {psnr_drop:.2f} dB, limit {target_drop:g} dB; encoding again at "
                     f"distortion {distortion:.2g}"
                 )
-                candidate = self.encode(distortion)
+                candidate = self.encode(distortion, encoding)
                 candidate = dataclasses.replace(
                     candidate, measured_error=references.measure_error(self.decode(candidate))
                 )

@@ -163,9 +163,7 @@ def subset_decoded(model: HybridModel, decoded: Decoded, kept: np.ndarray) -> tu
     return model.subset(index), decoded[index]
 
 
-def predict_errors(
-    model: HybridModel, planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity
-) -> dict[str, float]:
+def predict_errors(planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity) -> dict[str, float]:
     """Predict the mean squared error that compression adds to pictures, for each section and for PRUNED_KEY."""
     removed = np.delete(sensitivity.removals, quantized.plan.kept)
     return {PRUNED_KEY: float(removed.sum()), **_predict_quantization_errors(planned, quantized, sensitivity)}

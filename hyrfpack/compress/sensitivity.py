@@ -146,42 +146,44 @@ def measure_sensitivity(
     jacobian = _cube_jacobian(model)
     required = {name: parameter.requires_grad for name, parameter in model.named_parameters()}
     pixels, field_pixels = 0, 0
-    for number, camera in enumerate(views):
-        progress(TaskEvent(f"measuring sensitivities, view {number + 1}/{len(views)}", number / len(views)))
-        # Views at and between cameras alternate, so both kinds are among the views of the fields.
-        with_fields = number % (2 * field_interval) < 2
+    try:
+        for number, camera in enumerate(views):
+            progress(TaskEvent(f"measuring sensitivities, view {number + 1}/{len(views)}", number / len(views)))
+            # Views at and between cameras alternate, so both kinds are among the views of the fields.
+            with_fields = number % (2 * field_interval) < 2
+            for name, parameter in model.named_parameters():
+                parameter.requires_grad_(with_fields or name.startswith("gaussians."))
+                parameter.grad = None
+            # A window renders only the Gaussians that it can show, so that gradients of the others take no memory.
+            index: slice | torch.Tensor = slice(None)
+            shown = model
+            if not are_pictures:
+                index = _indices_in_view(model, camera)
+                shown = model.subset(index)
+            residuals = _residuals(shown)
+            for values in residuals.values():
+                values.requires_grad_(True)
+            rgb = render_view(shown, camera).rgb
+            signs = draw_signs(rgb, generator)
+            if rgb.requires_grad:
+                (rgb * signs).sum().backward()
+            pixels += rgb.numel()
+            field_pixels += rgb.numel() * with_fields
+            for name, values in (*shown.named_parameters(), *shown.named_buffers()):
+                gradient, values.grad = values.grad, None
+                if gradient is None:
+                    continue
+                if name == "gaussians.positions":
+                    gradient = (jacobian[index] * gradient[:, :, None]).sum(1)
+                if name.startswith("gaussians."):
+                    squares[name][index] += gradient.square()
+                else:
+                    squares[name] += gradient.square()
+            for values in residuals.values():
+                values.requires_grad_(False)
+    finally:
         for name, parameter in model.named_parameters():
-            parameter.requires_grad_(with_fields or name.startswith("gaussians."))
-            parameter.grad = None
-        # A window renders only the Gaussians that it can show, so that gradients of the others take no memory.
-        index: slice | torch.Tensor = slice(None)
-        shown = model
-        if not are_pictures:
-            index = _indices_in_view(model, camera)
-            shown = model.subset(index)
-        residuals = _residuals(shown)
-        for values in residuals.values():
-            values.requires_grad_(True)
-        rgb = render_view(shown, camera).rgb
-        signs = draw_signs(rgb, generator)
-        if rgb.requires_grad:
-            (rgb * signs).sum().backward()
-        pixels += rgb.numel()
-        field_pixels += rgb.numel() * with_fields
-        for name, values in (*shown.named_parameters(), *shown.named_buffers()):
-            gradient, values.grad = values.grad, None
-            if gradient is None:
-                continue
-            if name == "gaussians.positions":
-                gradient = (jacobian[index] * gradient[:, :, None]).sum(1)
-            if name.startswith("gaussians."):
-                squares[name][index] += gradient.square()
-            else:
-                squares[name] += gradient.square()
-        for values in residuals.values():
-            values.requires_grad_(False)
-    for name, parameter in model.named_parameters():
-        parameter.requires_grad_(required[name])
+            parameter.requires_grad_(required[name])
     at, _ = sample_views(cameras, len(views) // 2, seed)
     return _combine(model, squares, pixels, field_pixels, at, windows.pictures, jacobian)
 

@@ -45,7 +45,7 @@ class Evaluation:
         psnr_consistent: PSNR of renders at the model's consistent exposure; None for splats and for models without an
             exposure map.
         psnr_corrected: PSNR of renders after an affine colour correction to the photo that they are scored against, see
-            `hyrfpack.evaluate.exposure.corrected`.
+            `hyrfpack.evaluate.exposure.correct_colors`.
         ssim: SSIM of the renders of `psnr`, with a Gaussian window of 11x11 pixels and sigma 1.5.
         lpips: LPIPS of the renders of `psnr`, or None without weights.
         lpips_reason: why lpips is None, or the network that computed it.
@@ -179,6 +179,6 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def picture_names(views: Sequence[View], count: int = DEFAULT_PICTURE_COUNT) -> dict[int, str]:
-    """Return the names of the pictures that `evaluate` writes, by the index of their view."""
+    """Return the names of the pictures that `evaluate_model` writes, by the index of their view."""
     names = unique_stems([view.name for view in views])
     return {index: f"{names[index]}.png" for index in evenly_spaced(range(len(views)), count)}

@@ -175,19 +175,17 @@ def blank_figure(width: float, height: float, layout: Literal["constrained"] | N
     return figure
 
 
-def save_figure(
-    path: str | os.PathLike[str], figure: Figure, *, overwrite: bool = True, rename: bool = True, **options: Any
-) -> Path:
+def save_figure(path: str | os.PathLike[str], figure: Figure, *, overwrite: bool = True, **options: Any) -> Path:
     """Write a figure in one step, create its folder if needed, and return the path that was written.
 
-    `overwrite` and `rename` are those of `hyrfpack.atomic.pending_file`, `options` those of matplotlib's `savefig`.
+    `overwrite` is that of `hyrfpack.atomic.pending_file`, `options` are those of matplotlib's `savefig`.
 
     Raises:
         HyrfError: the folder or the file cannot be written.
     """
     data = io.BytesIO()
     figure.savefig(data, dpi=120, **options)
-    return write_atomic(path, data.getbuffer(), overwrite=overwrite, rename=rename)
+    return write_atomic(path, data.getbuffer(), overwrite=overwrite)
 
 
 def figure_to_svg(figure: Figure) -> str:

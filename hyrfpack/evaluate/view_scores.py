@@ -55,7 +55,7 @@ class Comparison:
     seconds: float
 
     def draw(self) -> Image.Image:
-        """Draw a picture of photo, render and error, with the scores below."""
+        """Draw a picture of photo, render and error, with the scores above."""
         perceptual = "" if self.score.lpips is None else f"   LPIPS {self.score.lpips:.3f}"
         caption = f"{self.score.name}   {self.score.psnr:.2f} dB   SSIM {self.score.ssim:.3f}{perceptual}"
         return draw_comparison(self.photo, self.render, self.mask, caption)

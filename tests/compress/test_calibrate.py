@@ -42,7 +42,7 @@ def predict_and_measure_error(model: HybridModel, sensitivity: Sensitivity, dist
     """Return the predicted error of a packed file, and the error measured at held-out viewpoints."""
     quantized = plan_and_quantize(model, sensitivity, distortion)
     decoded = decode_model(encode_model(model, "compact", quantized=quantized))
-    predicted = predict_errors(model, quantized.plan.apply(model), quantized, sensitivity)
+    predicted = predict_errors(quantized.plan.apply(model), quantized, sensitivity)
     return sum(predicted.values()), ReferenceRenders.from_model(model, HELD_OUT_CAMERAS).measure_error(decoded)
 
 

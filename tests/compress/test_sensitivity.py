@@ -22,6 +22,7 @@ from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import SECTION_PARAMETERS
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.contraction import contract, expand
+from hyrfpack.progress import TaskEvent
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 
@@ -269,6 +270,19 @@ def test_requires_grad_is_unchanged(wanted):
     model = decode_model(encode_model(ball_model())).requires_grad_(wanted)
     sensitivity = measure_sensitivity(model, RING_CAMERAS[:2])
     assert sensitivity.colors.max() > 1e-12
+    assert all(parameter.requires_grad == wanted for parameter in model.parameters())
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_requires_grad_is_unchanged_after_an_interrupt(wanted):
+    model = decode_model(encode_model(ball_model())).requires_grad_(wanted)
+
+    def interrupt(event: TaskEvent) -> None:
+        if "view 2/" in event.task:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        measure_sensitivity(model, RING_CAMERAS[:2], progress=interrupt)
     assert all(parameter.requires_grad == wanted for parameter in model.parameters())
 
 
