@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
-from hyrfpack.config.settings import OneOf, Range, check_settings
+from hyrfpack.checks import check_int, check_pair
+from hyrfpack.config.settings import LARGEST_SEED, OneOf, Range, check_settings
 from hyrfpack.errors import HyrfError
 
 PROFILES = ("raw", "paper", "compact")
@@ -34,8 +35,12 @@ class PaperSettings:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for stages, size in (self.color, self.scale, self.opacity):
-            if not (1 <= stages <= MAX_VQ_STAGES and 1 <= size <= MAX_VQ_CODEWORDS):
+        check_int("seed", self.seed, 0, LARGEST_SEED)
+        for name in ("color", "scale", "opacity"):
+            check_pair(name, getattr(self, name))
+            stages, size = getattr(self, name)
+            are_ints = isinstance(stages, int) and isinstance(size, int)
+            if not (are_ints and 1 <= stages <= MAX_VQ_STAGES and 1 <= size <= MAX_VQ_CODEWORDS):
                 raise HyrfError(
                     f"the paper profile was asked for {stages} stages of {size} codewords",
                     fix=f"use 1 to {MAX_VQ_STAGES} stages of 1 to {MAX_VQ_CODEWORDS}",

@@ -26,10 +26,19 @@ def test_a_value_out_of_range_is_an_error_that_names_the_setting(settings, words
         CompressConfig(**settings)
 
 
-@pytest.mark.parametrize("color", [(0, 64), (17, 64), (2, 0), (2, 257)])
+@pytest.mark.parametrize("color", [(0, 64), (17, 64), (2, 0), (2, 257), (2.5, 64), ("2", 64)])
 def test_stages_and_codewords_of_paper_are_limited(color):
     with pytest.raises(HyrfError, match="use 1 to 16 stages of 1 to 256"):
         PaperSettings(color=color)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [({"color": 5}, "color is 5; it must be a tuple"), ({"seed": -1}, "seed is -1"), ({"seed": 1.0}, "seed is 1.0")],
+)
+def test_settings_of_paper_of_another_type_are_an_error(settings, words):
+    with pytest.raises(ValueError, match=words):
+        PaperSettings(**settings)
 
 
 def test_the_encoder_gets_the_settings_of_paper():

@@ -91,6 +91,11 @@ def test_a_value_outside_the_limits_is_an_error_that_names_the_setting(wrong):
         BlurConfig(**wrong)
 
 
+def test_a_text_that_is_none_is_an_error_that_names_the_setting():
+    with pytest.raises(ValueError, match="^title is 3; it must be a text$"):
+        ExportConfig(title=3)
+
+
 def test_the_limits_belong_to_the_range_and_none_is_allowed_where_the_annotation_says_so():
     BlurConfig(radius=1, border=None, edge=None, strength=0, gamma=None)
     BlurConfig(radius=99, border=0, edge="wrap", strength=1e9, gamma=True)
