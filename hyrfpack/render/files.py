@@ -141,10 +141,15 @@ def unique_stems(names: Sequence[str]) -> list[str]:
         str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).suffix.lower() in PICTURE_SUFFIXES else name
         for name in full
     ]
-    chosen = bare if len(set(bare)) == len(bare) else full
-    if len(set(chosen)) < len(chosen):
+    chosen = bare if _are_distinct(bare) else full
+    if not _are_distinct(chosen):
         chosen = [f"{number:04d}_{name}" for number, name in enumerate(chosen)]
     return chosen
+
+
+def _are_distinct(names: Sequence[str]) -> bool:
+    """Return whether all names differ, also on file systems that ignore case."""
+    return len({name.casefold() for name in names}) == len(names)
 
 
 def _safe_relative_path(name: str) -> str:

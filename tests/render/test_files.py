@@ -21,6 +21,8 @@ from hyrfpack.render.video import write_video
     [
         (["b.JPG", "left/0001.png"], ["b", "left/0001"]),
         (["a.jpg", "a.png"], ["a.jpg", "a.png"]),
+        (["a.jpg", "A.png"], ["a.jpg", "A.png"]),
+        (["a.jpg", "A.jpg"], ["0000_a.jpg", "0001_A.jpg"]),
         (["frame.0001", "frame.0002"], ["frame.0001", "frame.0002"]),
         (["../../etc/passwd", "/abs/x.png", "..\\y.png"], ["etc/passwd", "abs/x", "y"]),
         (["", ".."], ["0000_view", "0001_view"]),
