@@ -46,7 +46,7 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
         profile: "raw" (float32, exact), "paper" (see `hyrfpack.format.paper`) or "compact" (`hyrfpack.format.compact`).
         provenance: any JSON object that says where the model comes from. It is stored for readers of the file.
         settings: settings of the profile: for "paper" the fields of `hyrfpack.PaperSettings`, for "compact" the
-            `quantized` numbers from `hyrfpack.compress_model`; "raw" has none.
+            `quantized` numbers from `hyrfpack.compress.quantize.quantize`; "raw" has none.
 
     Raises:
         HyrfError: the profile does not exist, or a parameter is NaN, infinite or too large for the profile.
@@ -55,6 +55,11 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
     check_type("model", model, HybridModel)
     if profile not in PROFILES:
         raise HyrfError(f"there is no profile '{profile}'", fix=f"use one of: {', '.join(PROFILES)}")
+    if profile == "compact" and "quantized" not in settings:
+        raise HyrfError(
+            "profile 'compact' takes numbers that were quantised beforehand",
+            fix="save the model with profile 'raw', and compress that file with `hyrfpack.compress_model`",
+        )
     sections, used = PROFILES[profile](model, **settings)
     counts = [section.raw_length // 12 for section in sections if group_and_layer(section.type)[0] == POSITIONS]
     layers = counts if len(counts) > 1 else []

@@ -54,7 +54,7 @@ def read_part_names(container: Container) -> list[str]:
         raise HyrfFormatError(f"{name}: the names of its parts cannot be read", fix="update hyrfpack")
     try:
         text = bytes(container[PART_NAMES].data).decode("utf-8")
-        names = json.loads(text, parse_constant=_reject_constant)["names"]
+        names = json.loads(text, parse_constant=reject_constant)["names"]
         if not isinstance(names, list):
             raise ValueError("the names are no list")
         check_part_names(names)
@@ -70,7 +70,8 @@ def printable_name(name: str) -> str:
     return _CONTROL_CHARACTERS.sub("", name)[: MAX_NAME_LENGTH - 3] or "part"
 
 
-def _reject_constant(name: str) -> None:
+def reject_constant(name: str) -> None:
+    """Raise ValueError for a constant of JSON, NaN or infinity, that Python's parser accepts."""
     raise ValueError(f"the number {name} is not finite")
 
 

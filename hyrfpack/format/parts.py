@@ -35,7 +35,7 @@ def encode_parts(parts: Sequence[tuple[str, bytes]]) -> bytes:
         sections.append(Section(part_section(number), CODEC_FILE, data, len(data)))
     data = write_container(sections, minor=MERGED_MINOR_VERSION)
     try:
-        _check_gaussians(open_parts(read_container(data, SECTION_CONTENTS)), len(data))
+        _check_gaussians(open_parts(read_container(data, SECTION_CONTENTS)), len(data), "the merged file")
     except HyrfFormatError as error:
         raise HyrfError(error.problem, fix="merge fewer models") from error
     return data
@@ -110,7 +110,7 @@ def decode_parts(container: Container) -> HybridModel | MergedModel:
     if PART_NAMES not in container.entries:
         return decode_container(container)
     parts = open_parts(container)
-    _check_gaussians(parts, container.length)
+    _check_gaussians(parts, container.length, container.name)
     if len({parse_config(read_metadata(part).config).antialiased for _, part in parts}) > 1:
         raise HyrfFormatError(
             f"{container.name}: some of its parts are antialiased and others are not", fix="write the file again"
@@ -119,11 +119,11 @@ def decode_parts(container: Container) -> HybridModel | MergedModel:
     return MergedModel(names, models)
 
 
-def _check_gaussians(parts: Sequence[tuple[str, Container]], length: int) -> None:
-    """Raise HyrfFormatError if the parts claim more Gaussians than a file of `length` bytes may have."""
+def _check_gaussians(parts: Sequence[tuple[str, Container]], length: int, name: str) -> None:
+    """Raise HyrfFormatError if the parts claim more Gaussians than the file `name`, of `length` bytes, may have."""
     count, limit = sum(read_metadata(part).gaussians for _, part in parts), gaussian_limit(length)
     if count > limit:
         raise HyrfFormatError(
-            f"the parts claim {count:,} Gaussians, but the size of the file allows at most {limit:,}",
+            f"{name}: its parts claim {count:,} Gaussians, but the size of the file allows at most {limit:,}",
             fix="the file is damaged, copy or write it again",
         )

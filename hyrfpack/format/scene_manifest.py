@@ -9,13 +9,15 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from hyrfpack.config.split import MAX_LEVELS
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.metadata import writer_name
-from hyrfpack.format.part_names import ONE_PART_NAME, check_part_names
+from hyrfpack.format.part_names import ONE_PART_NAME, check_part_names, reject_constant
 from hyrfpack.format.run_folder import SCENE_MANIFEST_FILE as MANIFEST_NAME
 from hyrfpack.format.sections import MAX_PARTS
 from hyrfpack.format.shared import is_file_name
@@ -25,7 +27,6 @@ FORMAT_NAME = "hyrf-scene"
 ONE_PART_VERSION, PARTS_VERSION = (1, 0), (2, 0)
 MAX_MANIFEST_BYTES = 1 << 24
 MAX_CHUNKS = 1 << 16
-MAX_LEVELS = 8
 MAX_ERROR_RADII = 16
 MAX_TEXT_LENGTH = 1000
 _INTEGER_LIMIT = 1 << 40
@@ -177,7 +178,7 @@ def parse_manifest(data: bytes, name: str = MANIFEST_NAME) -> Manifest:
     try:
         if len(data) > MAX_MANIFEST_BYTES:
             raise ValueError(f"it has {len(data):,} bytes and may have {MAX_MANIFEST_BYTES:,}")
-        values = json.loads(data.decode("utf-8"), parse_constant=_reject_constant)
+        values = json.loads(data.decode("utf-8"), parse_constant=reject_constant)
         if not isinstance(values, dict) or values.get("format") != FORMAT_NAME:
             raise HyrfFormatError(f"{name}: this is not the manifest of a scene folder", fix="check the path")
         return _parse_values(values, _read_major_version(values.get("version"), name))
@@ -226,8 +227,9 @@ def _parse_values(values: Mapping[str, Any], major: int) -> Manifest:
     if sum(chunk.levels[0].gaussians for chunk in chunks) != manifest.gaussians:
         raise ValueError(f"the chunks do not add up to {manifest.gaussians:,} Gaussians")
     names = [item.file.lower() for item in manifest.files]  # Some file systems ignore case.
-    if len(set(names)) != len(names):
-        raise ValueError(f"two files are named '{next(name for name in names if names.count(name) > 1)}'")
+    name, count = Counter(names).most_common(1)[0]  # there is at least the file of one part
+    if count > 1:
+        raise ValueError(f"two files are named '{name}'")
     return manifest
 
 
@@ -316,7 +318,3 @@ def _numbers(values: Mapping[str, Any], key: str, lengths: range, minimum: float
     if not all(math.isfinite(number) and number >= minimum for number in floats):
         raise ValueError(f"'{key}' holds a number out of range")
     return floats
-
-
-def _reject_constant(name: str) -> None:
-    raise ValueError(f"the number {name} is not finite")

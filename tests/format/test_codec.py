@@ -235,6 +235,8 @@ def test_unknown_profile_and_settings_out_of_range_are_refused():
         encode_model(make_model(), "paper", color=(0, 64))
     with pytest.raises(HyrfError, match="257 codewords"):
         encode_model(make_model(), "paper", opacity=(1, 257))
+    with pytest.raises(HyrfError, match="'compact' takes numbers .*; save the model with profile 'raw'"):
+        encode_model(make_model(), "compact")
 
 
 def test_provenance_that_is_not_json_is_refused():

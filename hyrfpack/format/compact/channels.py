@@ -18,6 +18,7 @@ from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 
 MAX_ABS_CHANNEL_VALUE = 4096.0  # keeps fixed-point sums well within 64 bits
 _NUMBERS_PER_BLOCK = 1 << 16  # small enough that temporary arrays stay in the caches
+BASIS_BYTES = 36  # of three vectors of three float32
 _HEADER_STRUCT = struct.Struct("<fBIB")
 
 
@@ -94,3 +95,17 @@ def decode_channel(data: memoryview, classes: np.ndarray) -> tuple[np.ndarray, m
     values = numbers / FIXED_POINT_ONE
     values += mean
     return values, data[start + size :]
+
+
+def read_basis(data: memoryview) -> np.ndarray:
+    """Read the basis (3, 3) float32 in which colours are coded, from BASIS_BYTES bytes.
+
+    Raises:
+        DamagedDataError: there are fewer bytes, or they are damaged.
+    """
+    if len(data) < BASIS_BYTES:
+        raise DamagedDataError(f"its {len(data)} bytes are fewer than those of a basis; it is truncated")
+    basis = np.frombuffer(data, "<f4").reshape(3, 3)
+    if not (np.abs(basis) <= 1 + 2**-10).all():
+        raise DamagedDataError("its basis is not orthonormal; it is damaged")
+    return basis

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from hyrfpack.format.arrays import residual_widths
-from hyrfpack.format.compact.channels import Channel, decode_channel, encode_channel
+from hyrfpack.format.compact.channels import BASIS_BYTES, Channel, decode_channel, encode_channel, read_basis
 from hyrfpack.format.compact.groups import GroupSymbols, encode_groups
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.compact.residuals import ResidualSymbols, encode_residuals
@@ -125,12 +125,7 @@ def decode_channels(data: memoryview, points: LatticePoints, columns: int) -> np
     """
     basis = np.eye(columns)
     if columns == 3:
-        if len(data) < 36:
-            raise DamagedDataError(f"its {len(data)} bytes are fewer than those of a basis; it is truncated")
-        basis = np.frombuffer(data[:36], "<f4").reshape(3, 3)
-        data = data[36:]
-        if not (np.abs(basis) <= 1 + 2**-10).all():
-            raise DamagedDataError("its basis is not orthonormal; it is damaged")
+        basis, data = read_basis(data[:BASIS_BYTES]), data[BASIS_BYTES:]
     channels = []
     for _ in range(columns):
         values, data = decode_channel(data, points.classes)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hyrfpack.format.compact.channels import BASIS_BYTES, read_basis
 from hyrfpack.format.sections import HARMONICS
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import decode_integers, encode_integers
@@ -18,7 +19,6 @@ from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 
 MAX_CLASSES = 16
 MAX_ABS_SYMBOL = 1 << 24
-BASIS_BYTES = 36
 _HEADER_STRUCT = struct.Struct("<BI")
 _LENGTH_STRUCT = struct.Struct("<I")
 
@@ -136,9 +136,7 @@ def decode_residual_symbols(
         raise DamagedDataError("a flag is neither 0 nor 1; it is damaged")
     flags, basis = flags.astype(bool), None
     if group == HARMONICS:
-        basis = np.frombuffer(source.take(BASIS_BYTES), "<f4").reshape(3, 3)
-        if not (np.abs(basis) <= 1 + 2**-10).all():
-            raise DamagedDataError("its basis is not orthonormal; it is damaged")
+        basis = read_basis(source.take(BASIS_BYTES))
     chosen, all_codes, all_symbols = classes[flags], [], []
     for band in residual_bands(group, columns):
         codes = np.frombuffer(source.take(class_count), np.uint8)
