@@ -24,10 +24,11 @@ def catch_stop_signals(stop: Callable[[], bool] | None = None) -> Iterator[Calla
     Yields:
         A function that returns whether a stop was requested.
     """
-    requested = threading.Event()
+    # A threading.Event would hold its lock in `set`, and a second signal's handler would wait for that lock forever.
+    is_signalled = False
 
     def is_requested() -> bool:
-        return requested.is_set() or (stop is not None and stop())
+        return is_signalled or (stop is not None and stop())
 
     if threading.current_thread() is not threading.main_thread():  # Only the main thread can handle signals.
         yield is_requested
@@ -36,7 +37,8 @@ def catch_stop_signals(stop: Callable[[], bool] | None = None) -> Iterator[Calla
     previous = {number: handler for number, handler in found.items() if handler not in (signal.SIG_IGN, None)}
 
     def handle(number: int, _frame: object) -> None:
-        requested.set()
+        nonlocal is_signalled
+        is_signalled = True
         if number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, previous[number])
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 import weakref
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -293,6 +294,30 @@ def test_a_second_sighup_has_no_effect():
         signal.raise_signal(signal.SIGHUP)
         signal.raise_signal(signal.SIGHUP)
         assert stop()
+
+
+@pytest.mark.usefixtures("signals")
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="there is no SIGHUP here")
+def test_a_signal_at_any_line_of_the_handler_of_another_does_not_block():
+    def fail(*_: object) -> None:
+        raise TimeoutError("a handler waits for the one that it interrupted")
+
+    def raise_another(*_: object) -> Callable:
+        signal.raise_signal(signal.SIGHUP)
+        return raise_another
+
+    before, traced = signal.signal(signal.SIGALRM, fail), sys.gettrace()
+    signal.alarm(10)
+    try:
+        with catch_stop_signals() as stop:
+            sys.settrace(raise_another)
+            signal.raise_signal(signal.SIGHUP)
+            sys.settrace(traced)
+            assert stop()
+    finally:
+        sys.settrace(traced)
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def test_a_stop_asked_by_the_context_saves_a_checkpoint_after_the_step(tmp_path, uninterrupted_trainer):
