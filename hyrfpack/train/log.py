@@ -7,7 +7,8 @@ import logging
 import os
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TextIO
@@ -15,7 +16,7 @@ from typing import Any, TextIO
 import torch
 
 from hyrfpack.atomic import describe_rename, numbered_names
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, printable
 from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.progress import StepEvent
 from hyrfpack.progress.pace import StepPace
@@ -43,7 +44,8 @@ class TrainingLog:
         seconds             time since training started or was resumed
         seconds_left        estimated remaining time
 
-    If the file can no longer be written, as on a full disk, the log ends and the run continues.
+    If the file can no longer be written, as on a full disk, the log ends and the run continues. The same holds for
+    TensorBoard's files and any error of TensorBoard.
     """
 
     def __init__(self, path: Path, steps: int, done: int, device: torch.device, overwrite: bool = True) -> None:
@@ -63,15 +65,19 @@ class TrainingLog:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             if done or overwrite:
-                self.file: TextIO = open(path, "a" if done else "w", encoding="utf-8")
+                self.file: TextIO = _open_to_append(path) if done else open(path, "w", encoding="utf-8")
             else:
                 self.file = _open_new(path)
         except OSError as error:
-            raise HyrfError(f"{path}: the log cannot be written ({error.strerror})", fix="name another file") from error
+            raise HyrfError(
+                f"{path}: the log cannot be written ({error.strerror})", fix="name another file with `log`"
+            ) from error
         self.path = Path(self.file.name)
         if self.path != path:
             _LOG.warning(describe_rename(path, self.path))
-        self.scalars = _summary_writer(self.path)
+        self.scalars: Any = None
+        with self._scalars_dropped_on_error():
+            self.scalars = _summary_writer(_scalars_folder(self.path))
 
     def step(self, event: StepEvent) -> None:
         """Add a finished step, and write a record if one is due."""
@@ -100,18 +106,13 @@ class TrainingLog:
         self.losses.clear()
         self.errors.clear()
         self._write(record)
-        if self.scalars is not None:
-            for name in SCALAR_NAMES:
-                if record[name] is not None:
-                    self.scalars.add_scalar(f"train/{name}", record[name], event.step)
+        self._add_scalars("train", {name: record[name] for name in SCALAR_NAMES}, event.step)
 
     def end(self, *, complete: bool, step: int, **facts: Any) -> None:
         """Write the last record: whether the run is complete, and facts about the result."""
         self._write({"event": "end", "complete": complete, "step": step, **facts})
-        if self.scalars is not None:
-            for name, value in facts.items():
-                if isinstance(value, float):
-                    self.scalars.add_scalar(f"held-out/{name}", value, step)
+        scores = {name: value for name, value in facts.items() if isinstance(value, float)}
+        self._add_scalars("held-out", scores, step)
 
     def __enter__(self) -> TrainingLog:
         return self
@@ -121,8 +122,9 @@ class TrainingLog:
             self._write({"event": "end", "complete": False, "error": str(error)})
         with suppress(OSError):
             self.file.close()
-        if self.scalars is not None:
-            self.scalars.close()
+        with self._scalars_dropped_on_error():
+            if self.scalars is not None:
+                self.scalars.close()
 
     def _write(self, record: dict[str, Any]) -> None:
         if self.file.closed:
@@ -135,6 +137,40 @@ class TrainingLog:
             _LOG.warning(f"{self.path}: the log cannot be written ({error.strerror}); training continues without it")
             with suppress(OSError):  # Closing tries to write the buffered bytes again.
                 self.file.close()
+
+    def _add_scalars(self, group: str, values: dict[str, Any], step: int) -> None:
+        """Add TensorBoard scalars, named by group and name, if that is installed; values of None are left out."""
+        with self._scalars_dropped_on_error():
+            for name, value in values.items():
+                if self.scalars is not None and value is not None:
+                    self.scalars.add_scalar(f"{group}/{name}", value, step)
+
+    @contextmanager
+    def _scalars_dropped_on_error(self) -> Iterator[None]:
+        """Turn an error of the block, which uses TensorBoard, into a warning, and write no scalars from then on."""
+        try:
+            yield
+        except Exception as error:  # TensorBoard raises errors of many types, as on a full disk or a broken package.
+            self.scalars = None
+            reason = printable(str(error) or type(error).__name__)
+            _LOG.warning(
+                f"{_scalars_folder(self.path)}: TensorBoard's files cannot be written ({reason}); training continues "
+                "without them"
+            )
+
+
+def _open_to_append(path: Path) -> TextIO:
+    """Open a log to append records. A last line that a kill or a full disk has cut off gets its end first."""
+    is_cut_off = False
+    with suppress(OSError):  # The file may be new, or empty, or not readable.
+        if path.is_file():  # Reading a pipe would wait for its writer.
+            with open(path, "rb") as earlier:
+                earlier.seek(-1, os.SEEK_END)
+                is_cut_off = earlier.read() != b"\n"
+    file = open(path, "a", encoding="utf-8")
+    if is_cut_off:
+        file.write("\n")
+    return file
 
 
 def _open_new(path: Path) -> TextIO:
@@ -164,9 +200,14 @@ def _short(value: Any) -> Any:
     return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
-def _summary_writer(path: Path) -> Any:
+def _scalars_folder(log: Path) -> Path:
+    """Return the folder of TensorBoard's files beside a log."""
+    return log.with_suffix(".tensorboard")
+
+
+def _summary_writer(folder: Path) -> Any:
     if find_spec("tensorboard") is None:
         return None
     from torch.utils.tensorboard import SummaryWriter
 
-    return SummaryWriter(str(path.with_suffix(".tensorboard")))
+    return SummaryWriter(str(folder))

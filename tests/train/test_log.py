@@ -105,6 +105,17 @@ def test_a_resumed_run_appends_to_its_log_and_a_new_run_replaces_it(tmp_path: Pa
     assert [record["step"] for record in read_log(file)] == [1, 2, 2]
 
 
+@pytest.mark.parametrize("earlier", ["", '{"step": 1}\n', '{"step": 1}\n{"st'])
+def test_a_resumed_log_does_not_continue_a_line_that_was_cut_off(tmp_path: Path, earlier: str) -> None:
+    file = tmp_path / "log.jsonl"
+    file.write_text(earlier)
+    with TrainingLog(file, 2, 1, CPU_DEVICE) as written:
+        written.end(complete=False, step=1)
+
+    *kept, last = file.read_text().splitlines()
+    assert kept == earlier.splitlines() and json.loads(last)["event"] == "end"
+
+
 def _interrupt() -> None:
     raise KeyboardInterrupt
 
@@ -127,6 +138,11 @@ def test_a_log_that_cannot_be_written_is_an_error_before_the_first_step(tmp_path
             make_scene(), tmp_path / "run", LOGGED_CONFIG, context=QUIET_CONTEXT, log=tmp_path / "file" / "log.jsonl"
         )
     assert not (tmp_path / "run" / "model.hyrf").exists()
+
+
+def test_the_error_of_a_log_that_cannot_be_written_names_the_setting(tmp_path: Path) -> None:
+    with pytest.raises(HyrfError, match="the log cannot be written.*name another file with `log`"):
+        TrainingLog(tmp_path, 2, 0, CPU_DEVICE)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
@@ -163,6 +179,37 @@ def test_scalars_are_written_to_tensorboard_where_it_is_installed(
     assert scalars["train/loss"] == [(1, 0.5), (2, 0.25)] and scalars["train/gaussians"] == [(1, 7), (2, 8)]
     assert scalars["train/psnr"] == [(1, pytest.approx(10)), (2, pytest.approx(20))]
     assert scalars["held-out/psnr"] == [(2, 21.5)] and "closed" in scalars
+
+
+@pytest.mark.parametrize("broken", ["__init__", "add_scalar", "close"])
+def test_an_error_of_tensorboard_ends_its_scalars_and_not_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, broken: str
+) -> None:
+    class Writer:
+        def __init__(self, folder: str) -> None:
+            fail_in("__init__")
+
+        def add_scalar(self, name: str, value: float, step: int) -> None:
+            fail_in("add_scalar")
+
+        def close(self) -> None:
+            fail_in("close")
+
+    def fail_in(name: str) -> None:
+        if name == broken:
+            raise RuntimeError("the disk is full")
+
+    monkeypatch.setattr(log, "find_spec", lambda name: name == "tensorboard")
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=Writer))
+    with TrainingLog(tmp_path / "log.jsonl", 2, 0, CPU_DEVICE) as written:
+        written.step(StepEvent(1, 2, 0.5, 0.1, 7))
+        written.step(StepEvent(2, 2, 0.25, 0.01, 8))
+        written.end(complete=True, step=2, psnr=21.5)
+
+    assert [record["event"] for record in read_log(tmp_path / "log.jsonl")] == ["step", "step", "end"]
+    (message,) = caplog.messages
+    assert message.startswith(f"{tmp_path / 'log.tensorboard'}: TensorBoard's files cannot be written")
+    assert "(the disk is full)" in message
 
 
 def test_memory_is_in_bytes() -> None:
