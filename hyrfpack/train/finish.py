@@ -9,11 +9,11 @@ from pathlib import Path
 import torch
 
 from hyrfpack.config.train import TrainConfig
-from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE
+from hyrfpack.format.run_folder import CHECKPOINT_FILE
 from hyrfpack.progress import Progress
 from hyrfpack.scene import Scene
 from hyrfpack.train.log import TrainingLog
-from hyrfpack.train.results import Results, TrainingRecord, remove_if_possible, write_results
+from hyrfpack.train.results import Results, TrainingRecord, read_record, remove_if_possible, write_results
 
 _LOG = logging.getLogger(__name__)
 
@@ -50,7 +50,7 @@ def finish_run(
     overwrite: bool,
     owns_checkpoint: bool,
 ) -> TrainResult:
-    """Write the results of a model, remove the checkpoint if they are complete, and end the log.
+    """Write the results of a model, remove the checkpoint unless missing results need it, and end the log.
 
     Args:
         record, scene, out, config, device, progress, overwrite: see `write_results`.
@@ -59,7 +59,8 @@ def finish_run(
     """
     results = write_results(record, scene, out, config, device, progress, overwrite=overwrite)
     missing = _log_missing(results)
-    if METRICS_FILE not in results.missing and owns_checkpoint:
+    # Without a training record, only the checkpoint lets a later call complete the results.
+    if owns_checkpoint and (not results.missing or read_record(out) is not None):
         remove_if_possible(out / CHECKPOINT_FILE)
     if log is not None:
         facts = {name: results.metrics[name] for name in ("gaussians", "bytes")}

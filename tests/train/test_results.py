@@ -174,6 +174,19 @@ def test_without_space_for_the_training_record_the_checkpoint_stays_until_metric
     assert file_names(tmp_path) == COMPLETE_RUN_FILES and len(read_metrics(tmp_path)["curve"]) == 20
 
 
+def test_without_space_for_the_training_record_the_checkpoint_stays_until_all_pictures_exist(
+    full_disk_suffixes, tmp_path
+):
+    full_disk_suffixes |= {"training.json", ".png"}
+    result = train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
+    assert "views and curve.png are missing" in result.missing
+    assert {"model.hyrf", "checkpoint.pt", "metrics.json"} <= file_names(tmp_path)
+
+    full_disk_suffixes.clear()
+    train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=True, context=QUIET_CONTEXT)
+    assert file_names(tmp_path) == COMPLETE_RUN_FILES and len(list((tmp_path / "views").iterdir())) == 2
+
+
 def test_results_are_completed_with_the_settings_of_the_model_only(full_disk_suffixes, tmp_path):
     full_disk_suffixes.add("metrics.json")
     train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
