@@ -76,6 +76,6 @@ def _log_missing(results: Results) -> str:
         return ""
     names = " and ".join(filter(None, [", ".join(results.missing[:-1]), results.missing[-1]]))
     verb = "are" if len(results.missing) > 1 else "is"
-    sentence = f"{results.reasons[0]}; the model is finished, but {names} {verb} missing"
+    sentence = f"{'; '.join(dict.fromkeys(results.reasons))}; the model is finished, but {names} {verb} missing"
     _LOG.warning(sentence)
     return sentence

@@ -72,7 +72,7 @@ class Results:
     Attributes:
         metrics: content of `metrics.json`, without scores if these could not be computed.
         missing: files and folders that could not be written, relative to the run's folder.
-        reasons: one sentence for each failure, in the order in which they happened.
+        reasons: one sentence for each failure, in the order in which they happened; of pictures only the first.
     """
 
     metrics: dict[str, Any]
@@ -228,7 +228,7 @@ def write_results(
             reasons.append(str(error))
         if unwritten or not is_scored:
             missing.append(VIEWS_FOLDER)
-            reasons += unwritten
+            reasons += unwritten[:1]
     progress(TaskEvent(f"drawing {CURVE_FILE}"))
     try:
         draw_training_curve(metrics["curve"], out / CURVE_FILE, overwrite=overwrite)

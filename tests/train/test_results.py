@@ -108,6 +108,7 @@ def test_pictures_that_do_not_fit_do_not_fail_the_run(
     assert result.complete and read_metrics(tmp_path) == json.loads(json.dumps(result.metrics))
     verb = "is" if ending == "curve.png" else "are"
     assert f"the model is finished, but {missing} {verb} missing" in caplog.messages[-1]
+    assert caplog.messages[-1].count(".png: the disk is full") == len(missing.split(" and "))
 
     full_disk_suffixes.clear()
     fail_if_trained()
