@@ -41,7 +41,7 @@ def load_training_scene(model: str | os.PathLike[str]) -> Scene | None:
         path = reading.pop("path")
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
-    if not _is_reading(path, reading):
+    if not _is_reading(path, reading) or not all(type(size) is int for size in sizes):
         return None
     scene = load_scene(path, **reading)
     if sizes != (len(scene.train), len(scene.test)):

@@ -94,7 +94,15 @@ def read_record(out: Path) -> TrainingRecord | None:
         digest = hashlib.sha256((out / Path(record.model).name).read_bytes()).hexdigest()
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None
-    return record if record.model_sha256 == digest and isinstance(record.metrics, dict) else None
+    return record if record.model_sha256 == digest and _is_usable(record) else None
+
+
+def _is_usable(record: TrainingRecord) -> bool:
+    """Return whether a record from a run's folder, which may be damaged or hostile, has what its results need."""
+    if not isinstance(record.settings, dict) or not isinstance(record.metrics, dict):
+        return False
+    counts = (record.step, record.metrics.get("gaussians"), record.metrics.get("bytes"))
+    return Path(record.model).name == record.model and all(type(count) is int for count in counts)
 
 
 def changed_settings(record: TrainingRecord, scene: Scene, config: TrainConfig) -> list[str]:

@@ -20,6 +20,7 @@ from hyrfpack.progress import Event, TaskEvent
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer, train_model
 from hyrfpack.train import run as runs
+from hyrfpack.train.results import RECORD_FILE, TrainingRecord, read_record
 
 SHORT_CONFIG = TrainConfig(steps=20, seed=1, max_gaussians=120)
 COMPLETE_RUN_FILES = {"model.hyrf", "metrics.json", "curve.png", "views"}
@@ -235,6 +236,27 @@ def test_a_damaged_or_foreign_training_record_is_ignored(full_disk_suffixes, tmp
         train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     with pytest.raises(HyrfError, match="no checkpoint to resume"):
         train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=True, context=QUIET_CONTEXT)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {},
+        {"settings": []},
+        {"metrics": []},
+        {"metrics": {"gaussians": 5}},
+        {"metrics": {"gaussians": "5", "bytes": 5}},
+        {"step": "20"},
+        {"model": "folder/model.hyrf"},
+    ],
+    ids=str,
+)
+def test_a_training_record_with_invalid_values_is_ignored(tmp_path, damage):
+    (tmp_path / "model.hyrf").write_bytes(b"model")
+    facts = {"curve": [], "gaussians": 5, "bytes": 5}
+    record = TrainingRecord("model.hyrf", hashlib.sha256(b"model").hexdigest(), 20, {}, facts)
+    (tmp_path / RECORD_FILE).write_bytes(dataclasses.replace(record, **damage).encode())
+    assert read_record(tmp_path) == (None if damage else record)
 
 
 def test_the_log_of_a_completed_run_ends_with_its_scores(full_disk_suffixes, tmp_path):

@@ -75,6 +75,15 @@ def test_metrics_with_invalid_facts_give_no_photos(reading, run, tmp_path):
     assert load_training_scene(copy_run_with(run, tmp_path / "run", **reading)) is None
 
 
+@pytest.mark.parametrize("size", ["8", None, 8.0, True])
+def test_metrics_with_invalid_numbers_of_photos_give_no_photos(size, run, tmp_path):
+    model = copy_run_with(run, tmp_path / "run")
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    metrics["scene"]["train"] = size
+    (tmp_path / "run" / "metrics.json").write_text(json.dumps(metrics))
+    assert load_training_scene(model) is None
+
+
 def test_photos_that_are_gone_are_a_clear_error(run, tmp_path):
     with pytest.raises(HyrfDataError, match="no such folder"):
         load_training_scene(copy_run_with(run, tmp_path / "run", path=str(tmp_path / "moved")))
