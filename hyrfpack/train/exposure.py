@@ -117,7 +117,7 @@ def estimate_log_gains(observed: Observations, photos: int) -> np.ndarray:
     pair with `MIN_SHARED_POINTS` common points connects are not compared: each group keeps a mean near 0.
     """
     gains = np.zeros((photos, 3))
-    known = np.bincount(observed.photo, minlength=photos) >= MIN_POINTS_PER_PHOTO
+    known = _has_enough_points(observed, photos)
     if not known.any():
         return gains
     photo, logits = observed.photo, observed.logits
@@ -141,6 +141,11 @@ def estimate_log_gains(observed: Observations, photos: int) -> np.ndarray:
     gains[~known] = 0
     gains[known] -= gains[known].mean(0)
     return gains
+
+
+def _has_enough_points(observed: Observations, photos: int) -> np.ndarray:
+    """Return whether each photo has enough points to estimate its gains, (photos,) bool."""
+    return np.bincount(observed.photo, minlength=photos) >= MIN_POINTS_PER_PHOTO
 
 
 def _points_of_groups(observed: Observations, photos: int) -> np.ndarray:
@@ -240,13 +245,31 @@ class Exposures:
         self._steps = state["steps"].tolist()
 
 
-def estimate_exposure_spread(scene: Scene, cache: PictureCache) -> float:
-    """Estimate the standard deviation of the training photos' exposures in stops, from their tracks; 0 without tracks.
+def estimate_exposure_spread(scene: Scene, cache: PictureCache) -> float | None:
+    """Estimate the standard deviation of the training photos' exposures in stops, from their tracks.
+
+    Returns:
+        The standard deviation; None if fewer than two photos have `MIN_POINTS_PER_PHOTO` usable points.
 
     Raises:
         HyrfDataError: a photo cannot be read.
     """
-    return float(estimate_log_gains(observe(scene, cache), len(scene.train)).mean(1).std()) * STOPS_PER_LOG_GAIN
+    observed = observe(scene, cache)
+    return _spread_of(observed, estimate_log_gains(observed, len(scene.train)))
+
+
+def describe_exposure_spread(spread: float | None) -> str:
+    """Describe in words what `estimate_exposure_spread` returned."""
+    if spread is None:
+        return "no tracks show the photos' exposures"
+    return f"by their tracks the photos differ by {spread:.2f} stops"
+
+
+def _spread_of(observed: Observations, gains: np.ndarray) -> float | None:
+    """Return the standard deviation of exposures in stops, given log gains (N, 3); None if too few were estimated."""
+    if np.count_nonzero(_has_enough_points(observed, len(gains))) < 2:
+        return None
+    return float(gains.mean(1).std()) * STOPS_PER_LOG_GAIN
 
 
 def initialize_exposures(
@@ -270,9 +293,5 @@ def initialize_exposures(
         )
     observed = observe(scene, cache)
     gains = estimate_log_gains(observed, len(scene.train))
-    known = len(np.unique(observed.photo))
-    spread = float(gains.mean(1).std()) * STOPS_PER_LOG_GAIN
-    found = (
-        f"by their tracks the photos differ by {spread:.2f} stops" if known else "no tracks show the photos' exposures"
-    )
-    return Exposures(scene.train, gains, device), f"per-image gains; {found}"
+    reason = describe_exposure_spread(_spread_of(observed, gains))
+    return Exposures(scene.train, gains, device), f"per-image gains; {reason}"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hyrfpack.train.exposure import estimate_exposure_spread
+from hyrfpack.train.exposure import describe_exposure_spread, estimate_exposure_spread
 from hyrfpack.train.pilots import ScenePilots
 
 # Each pilot takes this share of the run's steps, within limits. Short pilots underestimate the gain of long runs, by up
@@ -73,8 +73,8 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
         PilotsStopped, HyrfError: as `ScenePilots.run`; a photo cannot be read.
     """
     spread = estimate_exposure_spread(pilots.scene, pilots.cache)
-    if spread < MIN_EXPOSURE_SPREAD_STOPS:
-        return False, f"by their tracks the photos differ by {spread:.2f} stops"
+    if spread is None or spread < MIN_EXPOSURE_SPREAD_STOPS:
+        return False, describe_exposure_spread(spread)
     is_large = spread >= LARGE_EXPOSURE_SPREAD_STOPS
     limit = -MAX_EXPOSURE_LOSS_DB if is_large else MIN_EXPOSURE_GAIN_DB
     rounds, steps = exposure_rounds(len(pilots.scene.train)), exposure_pilot_steps(pilots.config.steps)

@@ -14,7 +14,15 @@ from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, Trainer
-from hyrfpack.train.exposure import GAIN_DECAY, MIN_PIXEL_LEVEL, Exposures, Observations, estimate_log_gains, observe
+from hyrfpack.train.exposure import (
+    GAIN_DECAY,
+    MIN_PIXEL_LEVEL,
+    MIN_POINTS_PER_PHOTO,
+    Exposures,
+    Observations,
+    estimate_log_gains,
+    observe,
+)
 
 CPU_DEVICE = torch.device("cpu")
 SHORT_CONFIG = TrainConfig(steps=30, seed=3, max_gaussians=160, exposure=True)
@@ -204,6 +212,13 @@ def test_gains_of_photos_without_tracks_start_at_one():
     trainer = Trainer(dataclasses.replace(exposed_scene(alternating_gains(6)), tracks={}), SHORT_CONFIG)
     assert trainer.choices["exposure"] == "per-image gains; no tracks show the photos' exposures"
     assert torch.equal(trainer.exposures.values, torch.zeros(6, 3))
+
+
+def test_tracks_too_short_to_compare_photos_are_not_reported_as_equal_exposures():
+    scene = exposed_scene(alternating_gains(6))
+    few = {name: rows[: MIN_POINTS_PER_PHOTO - 1] for name, rows in scene.tracks.items()}
+    trainer = Trainer(dataclasses.replace(scene, tracks=few), SHORT_CONFIG)
+    assert trainer.choices["exposure"] == "per-image gains; no tracks show the photos' exposures"
 
 
 def test_an_interrupted_run_continues_to_the_same_bytes(tmp_path):

@@ -373,10 +373,17 @@ def test_too_few_unmasked_validation_photos_decide_nothing(scores, monkeypatch, 
     assert decision is False and f"{left} " in reason and "validation photos" in reason
 
 
-def test_photos_of_one_exposure_need_no_pilots():
+def test_photos_of_one_exposure_need_no_pilots(monkeypatch):
+    monkeypatch.setattr(exposure_pilots, "estimate_exposure_spread", lambda *_: 0.04)
     runs = ScenePilots(make_scene(20), LONG_CONFIG, PictureCache(), CPU_DEVICE)
     decision, reason = measure_exposure(runs)
-    assert (decision, runs.scores) == (False, []) and "stops" in reason
+    assert (decision, runs.scores) == (False, []) and reason == "by their tracks the photos differ by 0.04 stops"
+
+
+def test_photos_without_tracks_need_no_pilots_and_are_not_said_to_have_one_exposure():
+    runs = ScenePilots(make_scene(20), LONG_CONFIG, PictureCache(), CPU_DEVICE)
+    decision, reason = measure_exposure(runs)
+    assert (decision, runs.scores) == (False, []) and reason == "no tracks show the photos' exposures"
 
 
 @pytest.mark.parametrize(("photos", "rounds"), [(8, 3), (11, 3), (12, 2), (100, 2)])
