@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -161,10 +161,7 @@ class _Run:
         record = self.ranks.broadcast(self.ranks.run_on_all(self._check))
         if record is not None:
             return self._complete(record)
-        if self.overwrite and not self.resume and self.ranks.is_main:
-            # These belong to the earlier run, which this one replaces. They would be resumed if this one stopped early.
-            for name in (RECORD_FILE, BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE):
-                (self.out / name).unlink(missing_ok=True)
+        self.ranks.run_on_all(self._remove_earlier_run)
         decisions = self._decide()
         return TrainResult(False, 0, None, {}) if decisions is None else self._train(self._set_up(decisions), decisions)
 
@@ -188,6 +185,21 @@ class _Run:
         if record is None:
             check_photos(self.scene, self.cache, self.progress)
         return record
+
+    def _remove_earlier_run(self) -> None:
+        """Remove files of the run that this one replaces, which would be resumed if this one stopped early."""
+        if not self.overwrite or self.resume or not self.ranks.is_main:
+            return
+        for name in (RECORD_FILE, BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE):
+            path = self.out / name
+            try:
+                with suppress(FileNotFoundError, NotADirectoryError):
+                    path.unlink()
+            except OSError as error:
+                raise HyrfError(
+                    f"{path}: this file of an earlier run cannot be removed ({error.strerror or error})",
+                    fix="remove it yourself, or choose another folder",
+                ) from error
 
     def _complete(self, record: TrainingRecord) -> TrainResult:
         """Compute and write the missing results of a finished model; only rank 0 does so."""

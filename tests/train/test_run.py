@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import os
 import random
@@ -171,6 +172,29 @@ def test_an_overwriting_run_that_ends_before_its_first_checkpoint_does_not_leave
         train_model(make_scene(), tmp_path, RUN_CONFIG, overwrite=True, context=QUIET_CONTEXT)
     with pytest.raises(HyrfError, match="there is no checkpoint to resume"):
         train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, context=QUIET_CONTEXT)
+
+
+@pytest.mark.parametrize("name", ["training.json", "blocks/blocks.json", "checkpoint.pt"])
+def test_a_file_of_an_earlier_run_that_cannot_be_removed_is_a_clear_error(tmp_path, monkeypatch, name):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("")
+    remove = Path.unlink
+
+    def unlink(path: Path, missing_ok: bool = False) -> None:
+        if path == tmp_path / name:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        remove(path, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", unlink)
+    with pytest.raises(HyrfError, match=rf"{name}: .*earlier run cannot be removed \(Permission denied\); remove it"):
+        train_model(make_scene(), tmp_path, RUN_CONFIG, overwrite=True, context=QUIET_CONTEXT)
+
+
+def test_a_file_at_the_name_of_the_folder_of_blocks_does_not_stop_an_overwriting_run(tmp_path):
+    (tmp_path / "blocks").write_text("notes")
+    config = dataclasses.replace(RUN_CONFIG, steps=1)
+    assert train_model(make_scene(), tmp_path, config, overwrite=True, context=QUIET_CONTEXT).complete
+    assert (tmp_path / "blocks").read_text() == "notes"
 
 
 def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
