@@ -76,12 +76,16 @@ class ResolutionSchedule:
 
     def share_done(self, step: int) -> float:
         """Return the estimated share of the run's work that is done after a step, if no further change comes."""
+        parts = [(start, end, step_cost(factor)) for start, end, factor in self._parts()]
+        done = sum(cost * max(0, min(end, step) - start) for start, end, cost in parts)
+        return done / sum(cost * (end - start) for start, end, cost in parts)
+
+    def _parts(self) -> list[tuple[int, int, int]]:
+        """Return the steps before each part of the run, its last step and its factor; changes too late are left out."""
         changes = [(first - 1, factor) for first, factor in self.changes if first <= self._last_coarse_step]
         changes.append((self._last_coarse_step, 1))
         ends = [*(start for start, _ in changes[1:]), self._steps]
-        parts = [(start, end, step_cost(factor)) for (start, factor), end in zip(changes, ends, strict=True)]
-        done = sum(cost * max(0, min(end, step) - start) for start, end, cost in parts)
-        return done / sum(cost * (end - start) for start, end, cost in parts)
+        return [(start, end, factor) for (start, factor), end in zip(changes, ends, strict=True)]
 
     def render_settings(self, camera: Camera, step: int) -> RenderSettings:
         """Return the settings with which a step renders its view.
@@ -98,12 +102,7 @@ class ResolutionSchedule:
 
     def describe(self) -> str:
         """Return in words what was reduced; empty if nothing was."""
-        ends = [*(first - 1 for first, _ in self.changes[1:]), self._last_coarse_step]
-        parts = [
-            f"by {factor} until step {min(end, self._last_coarse_step):,}"
-            for (_, factor), end in zip(self.changes, ends, strict=True)
-            if factor > 1
-        ]
+        parts = [f"by {factor} until step {end:,}" for _, end, factor in self._parts() if factor > 1]
         return f"photos reduced {', '.join(parts)}" if parts else ""
 
 

@@ -61,6 +61,30 @@ def test_the_last_steps_are_at_full_resolution() -> None:
     assert schedule.factor(last) > 1 and schedule.factor(last + 1) == 1
 
 
+def test_only_changes_that_took_effect_are_described() -> None:
+    schedule = ResolutionSchedule([make_view(1600, 1066)], 30, 100)
+    middle = LARGE_PHOTO.pixels / 4
+    schedule.update(24 - PREFETCH_DEPTH, int(middle))  # takes effect at step 25, which is at full resolution anyway
+
+    assert [schedule.factor(step) for step in (1, 24, 25)] == [4, 4, 1]
+    assert schedule.describe() == "photos reduced by 4 until step 24"
+
+
+def test_a_run_of_one_step_describes_no_reduction() -> None:
+    schedule = ResolutionSchedule([make_view(1600, 1066)], 1, 100)
+
+    assert schedule.factor(1) == 1 and schedule.describe() == ""
+
+
+def test_each_part_of_a_run_is_described_with_its_last_step() -> None:
+    schedule = ResolutionSchedule([make_view(1600, 1066)], 1000, 100)
+    schedule.update(200, int(LARGE_PHOTO.pixels / 4))
+
+    last = 200 + PREFETCH_DEPTH
+    assert [schedule.factor(step) for step in (last, last + 1, 800, 801)] == [4, 2, 2, 1]
+    assert schedule.describe() == f"photos reduced by 4 until step {last}, by 2 until step 800"
+
+
 def test_a_schedule_that_is_off_reduces_nothing() -> None:
     schedule = ResolutionSchedule([make_view(1600, 1066)], 10, 100, is_on=False)
 
