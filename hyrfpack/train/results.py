@@ -101,6 +101,8 @@ def _is_usable(record: TrainingRecord) -> bool:
     """Return whether a record from a run's folder, which may be damaged or hostile, has what its results need."""
     if not isinstance(record.settings, dict) or not isinstance(record.metrics, dict):
         return False
+    if not isinstance(record.metrics.get("curve"), list):
+        return False
     counts = (record.step, record.metrics.get("gaussians"), record.metrics.get("bytes"))
     return Path(record.model).name == record.model and all(type(count) is int for count in counts)
 

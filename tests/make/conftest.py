@@ -82,7 +82,7 @@ def fake_train_model(scene, run, config, *, resume, context, **options) -> Train
         provenance = {"steps": config.steps, "settings": config.to_dict(), **scene_provenance(scene), "psnr": 25.0}
         data = encode_model(tiny_model(400), "raw", provenance)
         choices = {name: f"{getattr(config, name)}: as asked for" for name in ("max_gaussians", "preset")}
-        metrics = {"gaussians": 400, "bytes": len(data), "choices": choices, "device": "none"}
+        metrics = {"curve": [], "gaussians": 400, "bytes": len(data), "choices": choices, "device": "none"}
         record = TrainingRecord("model.hyrf", hashlib.sha256(data).hexdigest(), config.steps, {}, metrics)
         write_atomic(record_file, record.encode())
         write_atomic(run / "model.hyrf", data)
