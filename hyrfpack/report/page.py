@@ -48,7 +48,7 @@ def encode_page(
         "content": "\n".join(content),
         "scripts": f"{data}\n<script>{script}</script>" if script else "",
     }
-    return fill_template(read_asset("page.html"), values).encode()
+    return fill_template(read_asset("page.html"), values)
 
 
 def section(name: str, heading: str, *content: str) -> str:

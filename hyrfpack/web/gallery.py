@@ -58,7 +58,7 @@ def encode_gallery(title: str, cards: Sequence[Card], player: str) -> bytes:
         "style": STYLE_FILE_NAME,
         "cards": "\n".join(_card(card, player) for card in cards),
     }
-    return fill_template(read_web_file("hosted/gallery.html"), values).encode()
+    return fill_template(read_web_file("hosted/gallery.html"), values)
 
 
 def encode_gallery_style() -> bytes:

@@ -22,7 +22,7 @@ from hyrfpack.scene import Camera
 from hyrfpack.splats.formats import spz
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats
-from hyrfpack.web.player import assemble_player_page, json_element
+from hyrfpack.web.player import assemble_player_page, escape_surrogates, json_element
 
 SPZ_VERSION = 3  # this version is compressed by gzip, which every browser unpacks
 # Quality of the background's WebP, 0 to 100. 95 takes three times the bytes for 0.01 dB in pictures of real scenes.
@@ -194,7 +194,7 @@ def _scene_element(
         raise ValueError("a page needs a camera to start from")
     scene = {
         "kind": kind,
-        "title": title,
+        "title": escape_surrogates(title),
         **facts,
         "tolerance": RenderSettings().cull_tolerance,
         "solid": list(solid),

@@ -67,7 +67,7 @@ def encode_player(
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
     """
-    settings: dict = {"content": content, "title": title, "stages": stages or {}}
+    settings: dict = {"content": content, "title": escape_surrogates(title), "stages": stages or {}}
     if file is not None:
         settings["file"] = file
     if updates is not None:
@@ -189,7 +189,7 @@ def _fill_page(
         }
         | {f"edit_{name}": read_web_file(f"viewer/edit/{name}.html") if editable else "" for name in EDITING_ELEMENTS}
     )
-    return fill_template(read_web_file("viewer/page.html"), values).encode()
+    return fill_template(read_web_file("viewer/page.html"), values)
 
 
 def content_security_policy(
@@ -245,12 +245,17 @@ def encode_readme(title: str, entry: str, index: str, *, element: str | None = N
     """
     line = f'  <script src="hyrf-viewer.js"></script> <hyrf-viewer src="{element}"></hyrf-viewer>\n' if element else ""
     values = {"title": title, "version": __version__, "entry": entry, "index": index, "element": line}
-    return fill_template(read_web_file("hosted/README.txt"), values).encode()
+    return fill_template(read_web_file("hosted/README.txt"), values)
 
 
-def fill_template(template: str, values: dict[str, str]) -> str:
-    """Return a template with each {{name}} replaced by its value."""
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], template)
+def fill_template(template: str, values: dict[str, str]) -> bytes:
+    """Return a template with each {{name}} replaced by its value, as UTF-8 without surrogates."""
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], template).encode("utf-8", "backslashreplace")
+
+
+def escape_surrogates(text: str) -> str:
+    """Replace surrogates, which stand for bytes of a file name that are not valid UTF-8, by escapes ("\\udcff")."""
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def _main_script(editable: bool, is_hosted: bool) -> str:

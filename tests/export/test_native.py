@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import os
 import re
 
 import numpy as np
@@ -16,7 +17,7 @@ from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.config.export import ExportConfig
 from hyrfpack.errors import HyrfError, HyrfFormatError
-from hyrfpack.export import export_model
+from hyrfpack.export import export_gallery, export_model
 from hyrfpack.export.pages import MAX_POSTER_BYTES
 from hyrfpack.export.poster import encode_poster
 from hyrfpack.format import load_model, save_model
@@ -56,6 +57,27 @@ def test_the_page_contains_the_file_and_its_metadata(model_file, tmp_path):
     assert len(scene["cameras"]) == 12 and np.allclose(first, ring(20)[0].camera_from_world, atol=1e-6)
     assert (report.native, report.bytes, report.gaussians) == (True, len(page), 40)
     assert (report.views, report.psnr, report.psnr_baked, report.chosen_by) == (0, None, None, {})
+
+
+def test_names_that_are_not_valid_utf8_become_escapes_in_titles(model_file, tmp_path):
+    name = os.fsdecode(b"caf\xe9")
+    copy = tmp_path / f"{name}.hyrf"
+    try:
+        copy.write_bytes(model_file.read_bytes())
+    except OSError:
+        pytest.skip("this file system stores only names in UTF-8")
+    for target, config in (("native.html", ExportConfig(editable=True)), ("baked.html", ExportConfig(baked=True))):
+        (tmp_path / target).mkdir()
+        export_model(copy, tmp_path / target / f"{name}.html", config)
+        page = (tmp_path / target / f"{name}.html").read_bytes()
+        assert rb"<title>caf\udce9</title>" in page and extract_payload(page, "page")[0]["title"] == r"caf\udce9"
+    export_model(copy, tmp_path / "player", ExportConfig(credit=name))
+    export_gallery([copy], tmp_path / name)
+    page = (tmp_path / "player" / "index.html").read_text("utf-8")
+    assert r"<title>caf\udce9</title>" in page and r'"title": "caf\\udce9"' in page
+    assert (tmp_path / "player" / "README.txt").read_text("utf-8").startswith("caf\\udce9\n")
+    page = (tmp_path / name / "index.html").read_text("utf-8")
+    assert r"<title>caf\udce9</title>" in page and r">caf\udce9</a></h2>" in page
 
 
 def test_pages_and_players_have_the_editing_panel_on_request_only(model_file, tmp_path):
