@@ -170,7 +170,8 @@ def export_gallery(
         sources: at least one source as in `export_player`; a scene from the folder of a run is named after the folder.
         folder: output folder; created if it is missing. Files with other names stay.
         data: photos of each scene, or None. Held-out photos score a model, and the list shows the score. Without them
-            the list shows how well the model fits its training photos, if the file states it.
+            the list shows how well the model fits its training photos or the splats that it was imported from, if the
+            file states it.
         overwrite: replace existing files; if False, an existing file is an error.
         title: title of the list. Default: the name of the folder.
         credit: text below the title of each scene.

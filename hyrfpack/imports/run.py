@@ -174,9 +174,10 @@ def import_loaded_splats(
             f"{format_count(len(splats), 'Gaussian')} of degree {splats.degree} from {Path(name).name}, without photos"
         )
         choices = {"imported": imported}
-        # By default, `compress` adds a share of this error. That of the model itself would be next to none.
-        psnr = min(unpacked_psnr, config.psnr)
-        provenance = {"steps": 0, "seed": config.seed, "psnr": psnr, "choices": choices}
+        provenance: dict = {"steps": 0, "seed": config.seed, "choices": choices}
+        if config.target_bytes is None:  # With a target size, nobody knows the PSNR of the file before it is encoded.
+            # By default, `compress` adds a share of this error. That of the model itself would be next to none.
+            provenance["psnr"] = min(unpacked_psnr, config.psnr)
         packing = part_of_progress(progress, 0.7, 0.97)
         data = pack(prepared, config.psnr, provenance, packing, worst=config.worst, target_bytes=config.target_bytes)
         progress(TaskEvent("scoring the file", 0.97))

@@ -45,6 +45,16 @@ def test_same_splats_and_seed_give_the_same_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "a.hyrf").read_bytes() == (tmp_path / "b.hyrf").read_bytes()
 
 
+def test_a_gallery_shows_the_psnr_of_an_import_only_if_the_import_aimed_at_one(tmp_path: Path) -> None:
+    for name, change in (("psnr", {"psnr": 20.0}), ("size", {"target_bytes": 20_000})):
+        target = tmp_path / f"{name}.hyrf"
+        import_loaded_splats(ball_splats(40), target, replace(TINY_IMPORT_CONFIG, **change))
+        assert ("psnr" in hyrfpack.describe_file(target)["provenance"]) == (name == "psnr")
+        hyrfpack.export_gallery([target], tmp_path / name)
+    texts = {name: (tmp_path / name / "index.html").read_text("utf-8") for name in ("psnr", "size")}
+    assert "20.0 dB against the splats it was made of" in texts["psnr"] and " dB" not in texts["size"]
+
+
 def test_the_largest_seed_is_accepted(tmp_path: Path) -> None:
     report = import_loaded_splats(ball_splats(40), tmp_path / "x.hyrf", replace(TINY_IMPORT_CONFIG, seed=2**64 - 1))
     assert hyrfpack.describe_file(tmp_path / "x.hyrf")["provenance"]["seed"] == 2**64 - 1 and report.psnr > 10
