@@ -39,7 +39,7 @@ def processes_option(command: Command) -> Command:
             from hyrfpack.parallel.launch import launch
 
             ctx = click.get_current_context()
-            ctx.exit(launch(remove_option(stored_arguments(ctx)), processes))
+            ctx.exit(launch(remove_processes_option(stored_arguments(ctx)), processes))
         with join_processes() as ranks, _silence_unless(ranks.is_main):
             return command(*args, ranks=ranks, **options)
 
@@ -66,17 +66,17 @@ def _silence_unless(is_main: bool) -> Iterator[None]:
         click.get_current_context().exit(2)
 
 
-def remove_option(arguments: Sequence[str], option: str = PROCESSES_OPTION) -> list[str]:
-    """Return arguments without an option and its value.
+def remove_processes_option(arguments: Sequence[str]) -> list[str]:
+    """Return arguments without --processes and its value.
 
     Example:
-        >>> remove_option(["train", "photos", "--processes", "2", "--steps", "9"])
+        >>> remove_processes_option(["train", "photos", "--processes", "2", "--steps", "9"])
         ['train', 'photos', '--steps', '9']
     """
     left, words = [], iter(arguments)
     for word in words:
-        if word == option:
+        if word == PROCESSES_OPTION:
             next(words, None)
-        elif not word.startswith(f"{option}="):
+        elif not word.startswith(f"{PROCESSES_OPTION}="):
             left.append(word)
     return left

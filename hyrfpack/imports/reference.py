@@ -18,8 +18,6 @@ from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 
 LIGHT_VIEWS_IN_MEMORY = 8
-# Division by a smaller alpha would amplify noise in the colours of nearly transparent pixels.
-MIN_ALPHA = 1e-6
 
 
 @torch_on_one_thread()

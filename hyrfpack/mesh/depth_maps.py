@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,7 +59,6 @@ def render_depth_maps(
     model: HybridModel | MergedModel,
     cameras: Sequence[Camera],
     exposure: str,
-    on_map: Callable[[], None] = lambda: None,
 ) -> Iterator[DepthMap]:
     """Render a model's depth maps one after the other.
 
@@ -67,7 +66,6 @@ def render_depth_maps(
         model: a model on the CPU.
         cameras: cameras in world units; larger pictures are shrunk to MAX_MAP_SIDE_PIXELS.
         exposure: exposure of the colours, as in `RenderSettings`.
-        on_map: called after each map.
     """
     decoded, settings = model.decode(), RenderSettings(exposure=exposure)
     black = torch.zeros(3)
@@ -78,7 +76,6 @@ def render_depth_maps(
         alpha = seen.alpha.numpy()
         colors = seen.rgb.numpy() / np.maximum(alpha, 0.5)[..., None]
         yield make_depth_map(small, depth, alpha, np.round(255 * colors.clip(0, 1)).astype(np.uint8))
-        on_map()
 
 
 def make_depth_map(camera: Camera, depth: np.ndarray, alpha: np.ndarray, colors: np.ndarray) -> DepthMap:

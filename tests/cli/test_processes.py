@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rank_processes import ProcessOutcome, needs_ranks, run_command_on_ranks, torchrun_environment
 
-from hyrfpack.cli.processes import remove_option
+from hyrfpack.cli.processes import remove_processes_option
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.errors import HyrfError
 from hyrfpack.parallel.launch import launch
@@ -84,7 +84,7 @@ def model(run_and_outcomes) -> Path:
     ],
 )
 def test_the_option_is_removed_with_its_value(words, left):
-    assert remove_option(words.split()) == left.split()
+    assert remove_processes_option(words.split()) == left.split()
 
 
 @given(
@@ -93,7 +93,7 @@ def test_the_option_is_removed_with_its_value(words, left):
 def test_all_other_arguments_keep_their_order(words, number, joined):
     for place in range(len(words) + 1):
         option = [f"--processes={number}"] if joined else ["--processes", str(number)]
-        assert remove_option([*words[:place], *option, *words[place:]]) == words
+        assert remove_processes_option([*words[:place], *option, *words[place:]]) == words
 
 
 def test_the_processes_option_is_rejected_in_one_of_several_processes(monkeypatch, tmp_path):
