@@ -116,9 +116,13 @@ def interpolate_views(cameras: Sequence[Camera], seed: int = 0, indices: Sequenc
 
 
 def shrink_camera(camera: Camera, max_side: int = MAX_SMALL_VIEW_SIDE_PIXELS) -> Camera:
-    """Shrink a camera's picture to at most `max_side` pixels on its longer side; the view stays the same."""
-    shrink = min(1.0, max_side / max(camera.width, camera.height))
-    width, height = max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink))
+    """Shrink a camera's picture to at most `max_side` pixels on its longer side; the view stays about the same."""
+    return resize_camera(camera, min(1.0, max_side / max(camera.width, camera.height)))
+
+
+def resize_camera(camera: Camera, ratio: float) -> Camera:
+    """Return a camera whose picture has a ratio of the pixels of each axis; the view stays about the same."""
+    width, height = (max(1, round(ratio * side)) for side in (camera.width, camera.height))
     x, y = width / camera.width, height / camera.height
     return dataclasses.replace(
         camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y

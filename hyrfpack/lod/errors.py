@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hyrfpack.cameras.view_sampling import resize_camera
 from hyrfpack.format.scene_model import join_parts
 from hyrfpack.lod.select import project_sphere
 from hyrfpack.model import Decoded, HybridModel
@@ -131,13 +132,6 @@ class _Pool:
         viewport = frame.local_viewport(camera, gaussians.means.dtype)
         settings = RenderSettings().raster_settings(config.antialiased)
         return rasterize(gaussians, torch.from_numpy(members).to(gaussians.means), viewport, settings).rgb
-
-
-def resize_camera(camera: Camera, share: float) -> Camera:
-    """Return a camera whose picture has a share of the pixels of each axis; the view stays about the same."""
-    width, height = (max(1, round(share * side)) for side in (camera.width, camera.height))
-    x, y = width / camera.width, height / camera.height
-    return Camera(width, height, x * camera.fx, y * camera.fy, x * camera.cx, y * camera.cy, camera.camera_from_world)
 
 
 def _node_weights(radius: float) -> np.ndarray:

@@ -15,7 +15,7 @@ import torch
 from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.capture import MIN_COARSE_CAMERAS, Capture
 from hyrfpack.cameras.files import camera_to_numbers
-from hyrfpack.cameras.view_sampling import sample_views
+from hyrfpack.cameras.view_sampling import resize_camera, sample_views
 from hyrfpack.checks import check_type
 from hyrfpack.config.split import SplitConfig
 from hyrfpack.context import RunContext
@@ -32,7 +32,7 @@ from hyrfpack.format.scene_model import join_parts
 from hyrfpack.format.sections import SECTION_CONTENTS
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.lod.encode import ChunkEncoder
-from hyrfpack.lod.errors import ERROR_RADII, measure_level_errors, resize_camera
+from hyrfpack.lod.errors import ERROR_RADII, measure_level_errors
 from hyrfpack.lod.merge import merge_gaussians
 from hyrfpack.lod.partition import partition
 from hyrfpack.lod.refit import refit_level

@@ -101,7 +101,7 @@ def align_poses(a: Poses, b: Poses) -> PoseAlignment:
         length = np.linalg.norm(positions_a[j] - positions_a[i])
         if length <= 0:
             continue
-        rotation = _nearest_rotation(relative_rotations[i] + relative_rotations[j])
+        rotation = nearest_rotation(relative_rotations[i] + relative_rotations[j])
         scale = float(np.linalg.norm(positions_b[j] - positions_b[i]) / length)
         shift = (positions_b[i] + positions_b[j] - scale * rotation @ (positions_a[i] + positions_a[j])) / 2
         guess = (scale, rotation, shift)
@@ -138,12 +138,12 @@ def _fit_similarity(
     from_a, from_b = a - mean_a, b - mean_b
     scale = float(np.sqrt((from_b**2).sum() / max((from_a**2).sum(), 1e-300)))
     rotations = relative_rotations.sum(0) / (2 * np.radians(MAX_ROTATION_DIFFERENCE_DEGREES) ** 2)
-    rotation = _nearest_rotation(scale * from_b.T @ from_a / position_unit**2 + rotations)
+    rotation = nearest_rotation(scale * from_b.T @ from_a / position_unit**2 + rotations)
     scale = float((from_b * (from_a @ rotation.T)).sum() / max((from_a**2).sum(), 1e-300))
     return scale, rotation, mean_b - scale * rotation @ mean_a
 
 
-def _nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     """Return the rotation R that maximises tr(R^T M)."""
     left, _, right = np.linalg.svd(matrix)
     return left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right

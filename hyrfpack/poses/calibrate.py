@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
+from hyrfpack.poses.alignment import nearest_rotation
 from hyrfpack.poses.job import DEFAULT_FOCAL_RATIO
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 
@@ -105,8 +106,7 @@ def _rotation_inlier_share(pair: PixelMatches, centre: np.ndarray, focal: float)
     weights = np.ones(len(first))
     error = np.zeros(len(first))
     for _ in range(6):
-        left, _, right = np.linalg.svd((second * weights[:, None]).T @ first)
-        rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+        rotation = nearest_rotation((second * weights[:, None]).T @ first)
         error = np.linalg.norm(first @ rotation.T - second, axis=1) * focal
         weights = 1 / np.maximum(error, 0.5)
     return float(np.mean(error < _ROTATION_INLIER_PIXELS))

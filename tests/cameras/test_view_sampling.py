@@ -3,13 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scenes import ball_points, ring, small_model
+from scenes import ball_points, camera_at, ring, small_model
 
 from hyrfpack.cameras.view_sampling import (
     INTERPOLATED_VIEW_SIZE_RATIO,
     MAX_SMALL_VIEW_SIDE_PIXELS,
     divide_view,
     interpolate_views,
+    resize_camera,
     sample_views,
     sample_windows,
     shrink_camera,
@@ -72,6 +73,15 @@ def test_large_cameras_are_reduced_with_the_same_field_of_view():
     assert (small.width, small.height) == (MAX_SMALL_VIEW_SIDE_PIXELS, MAX_SMALL_VIEW_SIDE_PIXELS * 3 // 4)
     assert np.allclose(np.array(small.intrinsics) * 4000 / MAX_SMALL_VIEW_SIDE_PIXELS, large.intrinsics)
     assert shrink_camera(small) == small
+
+
+def test_a_resized_camera_sees_the_same_view():
+    camera = camera_at((0.0, -3.0, 1.0), width=64, height=32, focal=50.0)
+
+    half = resize_camera(camera, 0.5)
+
+    assert (half.width, half.height, half.fx, half.cx) == (32, 16, 25.0, 16.0)
+    np.testing.assert_array_equal(half.camera_from_world, camera.camera_from_world)
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(3, 2), (1, 1), (1, 5)])

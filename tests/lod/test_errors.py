@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scenes import ball_points, camera_at, ring, small_model
+from scenes import ball_points, ring, small_model
 
 from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, ScenePart
 from hyrfpack.format.scene_model import join_chunks
 from hyrfpack.lod import errors
-from hyrfpack.lod.errors import ERROR_RADII, measure_level_errors, resize_camera
+from hyrfpack.lod.errors import ERROR_RADII, measure_level_errors
 from hyrfpack.lod.select import predict_errors
 from hyrfpack.render import render_view
 
@@ -60,12 +60,3 @@ def test_chunks_of_two_parts_have_the_errors_of_chunks_of_one(monkeypatch):
     parts = measure_level_errors(levels, spheres, cameras, fields=[levels[0][0]] * 2, parts=[0, 1])
 
     np.testing.assert_allclose(parts, together, rtol=1e-3)
-
-
-def test_a_resized_camera_sees_the_same_view():
-    camera = camera_at((0.0, -3.0, 1.0), width=64, height=32, focal=50.0)
-
-    half = resize_camera(camera, 0.5)
-
-    assert (half.width, half.height, half.fx, half.cx) == (32, 16, 25.0, 16.0)
-    np.testing.assert_array_equal(half.camera_from_world, camera.camera_from_world)

@@ -20,10 +20,9 @@ import numpy as np
 import torch
 
 import hyrfpack
-from hyrfpack.cameras.view_sampling import interpolate_views
+from hyrfpack.cameras.view_sampling import interpolate_views, resize_camera
 from hyrfpack.config.split import SplitConfig
 from hyrfpack.lod import LevelRenderer
-from hyrfpack.lod.errors import resize_camera
 from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Scene, evenly_spaced
