@@ -31,7 +31,7 @@ class BakedChunk:
 
     Attributes:
         number: its number in the manifest.
-        levels: splats of each level, the finest first; a coarse level can be empty if the export selects Gaussians.
+        levels: splats of each level, the finest first; a coarse level is empty if no camera sees its Gaussians.
     """
 
     number: int
