@@ -13,7 +13,7 @@ import torch
 
 from hyrfpack.choices import DEFAULT_SPZ_VERSION, LOCAL_EXPOSURE, SPZ_TILE_CONTENT
 from hyrfpack.config.export import ConvertConfig, ExportConfig
-from hyrfpack.errors import HyrfError, needs_package
+from hyrfpack.errors import HyrfError, needs_package, suggest_command
 from hyrfpack.export.background import background_reach
 from hyrfpack.export.cameras import COLMAP_FILES
 from hyrfpack.export.source import Source
@@ -234,14 +234,21 @@ def check_model(loaded: Source, kind: FileKind, config: ExportConfig) -> None:
     crop, min_opacity = config.crop, config.min_opacity
     if crop is not None or min_opacity > 0:  # certain before the bake, because it raises no opacity
         positions = positions[selection_mask(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)]
-    reach = float(np.abs(positions).max())
-    if includes_background(loaded, kind, config):
-        reach = max(reach, background_reach(frame))
+    reach, limit = float(np.abs(positions).max()), f"but {kind.ending} is limited to {kind.max_coordinate:,}"
     if reach > kind.max_coordinate:
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        remedy = "leave out the far Gaussians with `crop`"
+        if (high - low).max() < 2 * kind.max_coordinate:
+            shift = ",".join(str(-round(middle)) for middle in ((low + high) / 2).tolist())
+            remedy = f"first move the scene to the origin with {suggest_command('edit')} and `translate={shift}`"
         raise HyrfError(
-            f"the scene reaches {reach:,.0f} units from the origin with its background, but {kind.ending} is limited "
-            f"to {kind.max_coordinate:,}",
-            fix="choose another format, or try `background=False`",
+            f"the Gaussians reach {reach:,.0f} units from the origin, {limit}",
+            fix=f"choose another format, or {remedy}",
+        )
+    if includes_background(loaded, kind, config) and (reach := background_reach(frame)) > kind.max_coordinate:
+        raise HyrfError(
+            f"the scene reaches {reach:,.0f} units from the origin with its background, {limit}",
+            fix="choose another format, or leave out the background with `background=False`",
         )
 
 

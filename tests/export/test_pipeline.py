@@ -436,6 +436,33 @@ def test_invalid_options_are_refused_before_the_bake(options, plain_file, tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("center", "unit", "message"),
+    [
+        (
+            (500_000, 5_000_000, 0),
+            10.0,
+            r"the Gaussians reach 5,000,00\d units from the origin, but \.spz is limited to 4,194,303; choose another "
+            r"format, or first move the scene to the origin with 'hyrfpack edit' and "
+            r"`translate=-(49999\d|50000\d),-(499999\d|500000\d),-?\d`",
+        ),
+        ((0, 0, 0), 1e7, r"the Gaussians reach \d,\d{3},\d{3} units .*, or leave out the far Gaussians with `crop`"),
+        (
+            (0, 0, 0),
+            1e5,
+            r"the scene reaches [\d,]+ units from the origin with its background, .*; choose another format, or leave "
+            r"out the background with `background=False`",
+        ),
+    ],
+)
+def test_a_scene_too_far_from_the_origin_is_refused_before_the_bake(center, unit, message, tmp_path, fail_if_baked):
+    model = small_model(GAUSSIAN_POSITIONS, frame=Frame(center, unit, (1.0, 1.0, 1.0)), background=True)
+    source = write_model(tmp_path / "m.hyrf", model, [scale_and_move(camera, unit, center) for camera in ring(2)])
+    with pytest.raises(HyrfError) as refusal:
+        export(source, tmp_path / "a.spz")
+    assert re.fullmatch(message, str(refusal.value))
+
+
 def test_gaussian_options_for_a_file_of_cameras_are_refused(plain_file, tmp_path):
     for options in ({"crop": CROP_BOX}, {"min_opacity": 0.5}):
         with pytest.raises(HyrfError, match=r"holds only cameras[^\n]*$"):
