@@ -31,7 +31,7 @@ from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
 from hyrfpack.format import describe_file
 from hyrfpack.format.run_folder import name_model
-from hyrfpack.format.scene_folder import single_file
+from hyrfpack.format.scene_folder import SceneFolder, is_scene, single_file
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel
@@ -207,31 +207,38 @@ def export_gallery(
                 suggest_compression(source)
             files = [joined.enter_context(single_file(source)) for source in sources]
             output = joined.enter_context(_OutputFolder(Path(folder), overwrite))
-            return _write_gallery(files, output, scenes, title, credit, editable)
+            return _write_gallery(sources, files, output, scenes, title, credit, editable)
 
 
 def _write_gallery(
     sources: Sequence[StrPath],
+    files: Sequence[Path],
     output: _OutputFolder,
     scenes: Sequence[Scene | None],
     title: str | None,
     credit: str,
     editable: bool,
 ) -> ExportReport:
-    """Write the files of `export_gallery` into a folder that the caller has locked."""
-    contents = []
-    for source, scene in zip(sources, scenes, strict=True):  # all are read before anything is written
+    """Write the files of `export_gallery` into a folder that the caller has locked.
+
+    Args:
+        sources: `sources` of `export_gallery`.
+        files: the single file of each source.
+        output, scenes, title, credit, editable: the folder, and arguments of `export_gallery`.
+    """
+    playable, contents = [find_playable_file(file) for file in files], []
+    for source, file, scene in zip(sources, playable, scenes, strict=True):  # all are read before anything is written
         _LOG.info(f"reading {source}")
-        contents.append(_PlayableContent.read(find_playable_file(source), scene, with_quality=True))
+        contents.append(_PlayableContent.read(file, scene, with_quality=True))
     cards = []
-    for source, shown, (content, poster) in zip(
-        sources, contents, _choose_file_names(sources, is_gallery=True), strict=True
+    for source, file, shown, (content, poster) in zip(
+        sources, playable, contents, _choose_file_names(sources, is_gallery=True), strict=True
     ):
-        output.copy(content, find_playable_file(source))
+        output.copy(content, file)
         if shown.poster is not None:
             output.write(poster, encode_poster(shown.poster, "JPEG", MAX_POSTER_BYTES))
         picture = None if shown.poster is None else poster
-        cards.append(Card(name_model(source), content, picture, shown.count, shown.length, shown.quality))
+        cards.append(Card(_name_source(source), content, picture, shown.count, shown.length, shown.quality))
     title = _folder_title(output.path) if title is None else title
     pairs = zip(cards, contents, strict=True)
     stages = {card.content: shown.stage for card, shown in pairs if shown.stage}
@@ -374,17 +381,22 @@ def _choose_file_names(sources: Sequence[StrPath], *, is_gallery: bool) -> list[
         return [(f"{DEFAULT_SCENE_STEM}{_playable_ending(source)}", POSTER_NAME) for source in sources]
     names: list[str] = []
     for source in sources:
-        stem = re.sub(r"[^\w.-]+", "-", name_model(source)).strip("-.") or DEFAULT_SCENE_STEM
+        stem = re.sub(r"[^\w.-]+", "-", _name_source(source)).strip("-.") or DEFAULT_SCENE_STEM
         taken = {name.casefold() for name in names}
         numbered = (stem if number == 1 else f"{stem}-{number}" for number in count_up(1))
         names.append(next(name for name in numbered if name.casefold() not in taken))
     return [(f"{name}{_playable_ending(source)}", f"{name}.jpg") for name, source in zip(names, sources, strict=True)]
 
 
+def _name_source(source: StrPath) -> str:
+    """Return the name of a model, or of a scene folder if its manifest is given."""
+    return name_model(SceneFolder(source).path if is_scene(source) else source) or DEFAULT_SCENE_STEM
+
+
 def _playable_ending(path: StrPath) -> str:
-    """Return the ending of a file to be played; ".hyrf" for all files without an ending of splats."""
+    """Return the ending of a file to be played; ".hyrf" for folders and for all files without an ending of splats."""
     ending = Path(path).suffix.lower()
-    return ending if ending in READABLE_ENDINGS else HYRF_ENDING
+    return ending if ending in READABLE_ENDINGS and not os.path.isdir(path) else HYRF_ENDING
 
 
 def _folder_title(folder: StrPath) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -222,6 +223,18 @@ def test_file_names_are_sanitized_and_escaped(tmp_path):
     export_gallery([source], tmp_path / "g")
     assert {"b-ä.hyrf", "b-ä.jpg"} <= file_names(tmp_path / "g")
     assert "content=b-%C3%A4.hyrf&amp;poster=b-%C3%A4.jpg" in (tmp_path / "g" / "index.html").read_text()
+
+
+def test_a_manifest_is_named_after_its_folder_before_and_after_the_work(tmp_path, monkeypatch):
+    manifest = shutil.copytree(GOLDEN_SCENE, tmp_path / "city") / "scene.json"
+    export_gallery([manifest], tmp_path / "new")
+    assert "city.hyrf" in file_names(tmp_path / "new")
+    assert ">city</a>" in (tmp_path / "new" / "index.html").read_text()
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "city.hyrf").touch()
+    monkeypatch.setattr("hyrfpack.export.folder.single_file", lambda source: pytest.fail("the work began"))
+    with pytest.raises(HyrfError, match=r"city\.hyrf of the files to be written is there"):
+        export_gallery([manifest], tmp_path / "old", overwrite=False)
 
 
 def test_a_wrong_number_of_photo_sets_is_refused(model_file, tmp_path):
