@@ -5,16 +5,14 @@ from __future__ import annotations
 import logging
 import os
 import re
-import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import count as count_up
 from pathlib import Path
 
 from PIL import Image
 
-from hyrfpack.atomic import pending_file
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.checks import check_several, check_type
 from hyrfpack.counts import format_count
@@ -36,6 +34,7 @@ from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel
 from hyrfpack.outputs import Outputs
+from hyrfpack.outputs.indexed_folder import IndexedFolder
 from hyrfpack.scene import Scene
 from hyrfpack.splats.files import READABLE_ENDINGS, read_splats
 from hyrfpack.web.gallery import STYLE_FILE_NAME as GALLERY_STYLE_NAME
@@ -105,13 +104,13 @@ def export_player(
             suggest_compression(source)
         with ExitStack() as joined:
             file = None if source is None else joined.enter_context(single_file(source))
-            output = joined.enter_context(_OutputFolder(Path(folder), overwrite))
+            output = joined.enter_context(IndexedFolder(Path(folder), overwrite))
             return _write_player(file, output, data, title, credit, editable)
 
 
 def _write_player(
     source: StrPath | None,
-    output: _OutputFolder,
+    output: IndexedFolder,
     data: Scene | None,
     title: str | None,
     credit: str,
@@ -206,14 +205,14 @@ def export_gallery(
             for source in sources:
                 suggest_compression(source)
             files = [joined.enter_context(single_file(source)) for source in sources]
-            output = joined.enter_context(_OutputFolder(Path(folder), overwrite))
+            output = joined.enter_context(IndexedFolder(Path(folder), overwrite))
             return _write_gallery(sources, files, output, scenes, title, credit, editable)
 
 
 def _write_gallery(
     sources: Sequence[StrPath],
     files: Sequence[Path],
-    output: _OutputFolder,
+    output: IndexedFolder,
     scenes: Sequence[Scene | None],
     title: str | None,
     credit: str,
@@ -333,46 +332,6 @@ def _describe_quality(path: StrPath, model: HybridModel | MergedModel, data: Sce
         return ""
     imported = isinstance(choices, dict) and "imported" in choices
     return f"{stated:.1f} dB " + ("against the splats it was made of" if imported else "on its training photos")
-
-
-class _OutputFolder:
-    """An output folder that counts the bytes written; each file is written completely or not at all.
-
-    The files refer to each other by name, so a name that is taken causes an error instead of another name. If the block
-    fails, the files that were not there before are removed, so that the same call can be repeated.
-    """
-
-    def __init__(self, path: Path, overwrite: bool) -> None:
-        self.path, self.overwrite, self.bytes = path, overwrite, 0
-        self._added: list[Path] = []
-
-    def __enter__(self) -> _OutputFolder:
-        return self
-
-    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        if error is not None:
-            for path in self._added:
-                with suppress(OSError):
-                    path.unlink()
-
-    def write(self, name: str, data: bytes) -> None:
-        with self._pending(name, len(data)) as temporary:
-            temporary.write_bytes(data)
-
-    def copy(self, name: str, source: StrPath) -> None:
-        with self._pending(name, os.path.getsize(source)) as temporary:
-            shutil.copyfile(source, temporary)
-
-    @contextmanager
-    def _pending(self, name: str, length: int) -> Iterator[Path]:
-        """Yield the temporary path of a file that gets its name when the block ends."""
-        path = self.path / name
-        is_new = not path.exists()
-        with pending_file(path, length, overwrite=self.overwrite, rename=False) as pending:
-            yield pending.temporary
-        if is_new:
-            self._added.append(path)
-        self.bytes += path.stat().st_size
 
 
 def _choose_file_names(sources: Sequence[StrPath], *, is_gallery: bool) -> list[tuple[str, str]]:

@@ -21,11 +21,11 @@ import numpy as np
 
 from hyrfpack.export.baked_scene import ShownSplats
 from hyrfpack.export.boxes import Box, BoxTree
-from hyrfpack.export.indexed_folder import IndexedFolder, writing_indexed_folder
 from hyrfpack.export.kinds import STREAMED_SOG_FOLDER
 from hyrfpack.export.levels import BakedLevels
 from hyrfpack.format.metadata import writer_name
 from hyrfpack.format.scene_manifest import Chunk
+from hyrfpack.outputs.indexed_folder import IndexedFolder, writing_indexed_folder
 from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.splats import Splats, concatenate

@@ -33,11 +33,11 @@ import numpy as np
 
 from hyrfpack.export.baked_scene import ShownSplats
 from hyrfpack.export.boxes import Box, BoxTree
-from hyrfpack.export.indexed_folder import IndexedFolder, writing_indexed_folder
 from hyrfpack.export.kinds import SPZ_TILES_FOLDER, TILES_FOLDER
 from hyrfpack.export.levels import BakedChunk, BakedLevels
 from hyrfpack.format.metadata import writer_name
 from hyrfpack.format.scene_manifest import Chunk, Manifest
+from hyrfpack.outputs.indexed_folder import IndexedFolder, writing_indexed_folder
 from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.splats.formats import gltf
 from hyrfpack.splats.placement import local_origin, upright_rotation

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hyrfpack.atomic import write_atomic
 from hyrfpack.cameras.capture import MIN_COARSE_CAMERAS, Capture
 from hyrfpack.cameras.files import camera_to_numbers
 from hyrfpack.cameras.view_sampling import resize_camera, sample_views
@@ -40,6 +39,7 @@ from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.merged import MergedModel, parts_of
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.outputs import Outputs, StrPath
+from hyrfpack.outputs.indexed_folder import writing_indexed_folder
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 
@@ -349,22 +349,11 @@ def _make_manifest(
 
 def _write_folder(folder: Path, files: dict[str, bytes], manifest: Manifest, overwrite: bool) -> None:
     """Write all files and then the manifest; if anything fails, the folder holds no manifest and no new file."""
-    old = []
-    if overwrite:  # Without the old manifest, no mixture of old and new files can be taken for a scene.
-        old = _list_old_files(folder)
-        (folder / MANIFEST_NAME).unlink(missing_ok=True)
-    written = []
-    try:
+    old = _list_old_files(folder) if overwrite else []
+    with writing_indexed_folder(folder, MANIFEST_NAME, overwrite) as output:
         for name, data in files.items():
-            is_new = not (folder / name).exists()
-            write_atomic(folder / name, data, overwrite=overwrite, rename=False)
-            written += [folder / name] * is_new
-        write_atomic(folder / MANIFEST_NAME, manifest.to_json(), overwrite=overwrite, rename=False)
-    except BaseException:
-        for path in written:
-            with contextlib.suppress(OSError):
-                path.unlink()
-        raise
+            output.write(name, data)
+        output.write(MANIFEST_NAME, manifest.to_json())
     for name in set(old) - set(files):
         with contextlib.suppress(OSError):
             (folder / name).unlink()

@@ -1,4 +1,4 @@
-"""Outputs: which files may be written, and the names by which files of pictures, videos and poses are recognised."""
+"""Outputs: which files may be written, folders that an index names, and names of pictures, videos and poses."""
 
 from hyrfpack.outputs.checks import Outputs, StrPath
 from hyrfpack.outputs.names import (

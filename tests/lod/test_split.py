@@ -32,6 +32,7 @@ from hyrfpack.format.sections import SECTION_CONTENTS
 from hyrfpack.format.shared import CODEC_SHARED
 from hyrfpack.lod import LevelRenderer, split, split_model
 from hyrfpack.lod.errors import ERROR_RADII
+from hyrfpack.outputs import indexed_folder
 from hyrfpack.render import render_view
 from tools.safety import minimal_reader
 from tools.safety.make_golden import GOLDEN_FOLDER, GOLDEN_SCENE_FOLDER, GOLDEN_SCENE_SOURCE
@@ -343,7 +344,7 @@ def test_an_existing_scene_is_replaced_only_with_permission_and_completely(copy)
 
 
 def test_a_failure_leaves_no_half_written_folder(tmp_path, monkeypatch):
-    written, real = [], split.write_atomic
+    written, real = [], indexed_folder.write_atomic
 
     def fail_third(path, *args, **options):
         written.append(path)
@@ -351,7 +352,7 @@ def test_a_failure_leaves_no_half_written_folder(tmp_path, monkeypatch):
             raise HyrfError(f"{path}: the disk is full", fix="free space")
         return real(path, *args, **options)
 
-    monkeypatch.setattr(split, "write_atomic", fail_third)
+    monkeypatch.setattr(indexed_folder, "write_atomic", fail_third)
     with pytest.raises(HyrfError, match="disk is full"):
         split_model(COMPACT_FILE, tmp_path / "scene", SplitConfig(chunk_gaussians=400, levels=1), context=QUIET_CONTEXT)
 
