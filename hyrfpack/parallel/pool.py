@@ -104,7 +104,7 @@ def run_tasks(task: Callable[[int], None], count: int, *, sequential: bool = Fal
 
     Threads take tasks one by one, so that tasks of different length are balanced. The result must not depend on which
     thread runs which task, so each task must write to its own memory. Tasks that are started inside a task run one
-    after the other in the same thread. After the first error no further task is started.
+    after the other in the same thread. After the first error or an interrupt no further task is started.
 
     Args:
         task: function of the task's index.
@@ -133,8 +133,13 @@ def run_tasks(task: Callable[[int], None], count: int, *, sequential: bool = Fal
                 for _ in pending:  # Taking all remaining tasks keeps the other threads from starting them.
                     pass
 
-    for future in [_executor(threads).submit(worker) for _ in range(min(threads, count))]:
-        future.result()
+    try:
+        for future in [_executor(threads).submit(worker) for _ in range(min(threads, count))]:
+            future.result()
+    except BaseException:  # such as Ctrl-C, which only the main thread notices
+        for _ in pending:
+            pass
+        raise
     if errors:
         raise errors[min(errors)]
 

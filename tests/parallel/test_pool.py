@@ -7,6 +7,7 @@ import platform
 import subprocess
 import sys
 import threading
+from concurrent.futures import Future
 
 import pytest
 import torch
@@ -54,6 +55,27 @@ def test_the_first_error_is_raised() -> None:
 
     with pytest.raises(ValueError, match="3"):
         parallel_map(fail, list(range(6)))
+
+
+def test_an_interrupt_starts_no_further_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Otherwise the program ends only after all tasks, because Python waits for its threads."""
+    started: list[int] = []
+    interrupted = threading.Event()
+
+    def wait_for_interrupt(number: int) -> None:
+        started.append(number)
+        interrupted.wait(timeout=30)
+
+    def interrupt(future: Future) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Future, "result", interrupt)
+        run_tasks(wait_for_interrupt, 50)
+    interrupted.set()
+    both = threading.Barrier(2, timeout=30)
+    run_tasks(lambda _: both.wait(), 2)  # both threads have left the interrupted tasks
+    assert len(started) <= 2
 
 
 def test_torch_uses_one_thread_inside_a_task() -> None:
