@@ -85,7 +85,7 @@ def list_photos(folder: StrPath) -> list[Path]:
         ['0000.png', '0001.png']
     """
     for name in _EXPORTED_FILES:
-        if Path(folder, name).is_file():
+        if os.path.isfile(os.path.join(folder, name)):  # Path.is_file raises if the folder may not be searched
             raise HyrfDataError(
                 f"{folder}: this folder was exported ({name}), and its pictures are not photos",
                 fix="name the folder of the photos, or the model that was exported",

@@ -51,7 +51,7 @@ class RunStatus:
 
 def is_run_folder(path: str | os.PathLike[str]) -> bool:
     """Return whether a path is the folder of a training run, finished or not."""
-    return any(Path(path, name).is_file() for name in (MODEL_FILE, CHECKPOINT_FILE))
+    return any(_has_file(path, name) for name in (MODEL_FILE, CHECKPOINT_FILE))
 
 
 def find_model(path: str | os.PathLike[str]) -> Path:
@@ -60,7 +60,8 @@ def find_model(path: str | os.PathLike[str]) -> Path:
     Of a scene folder, it is the path of the manifest.
 
     Raises:
-        HyrfFormatError: `path` is a folder without a model, or the folder of a run that has not finished.
+        HyrfFormatError: `path` is a folder without a model, one that may not be read, or that of a run that has not
+            finished.
 
     Example:
         >>> from hyrfpack.format import find_model
@@ -70,12 +71,14 @@ def find_model(path: str | os.PathLike[str]) -> Path:
     path = Path(path)
     if not os.path.isdir(path):
         return path
-    if (path / MODEL_FILE).is_file():
+    if _has_file(path, MODEL_FILE):
         return path / MODEL_FILE
-    if (path / SCENE_MANIFEST_FILE).is_file():
+    if _has_file(path, SCENE_MANIFEST_FILE):
         return path / SCENE_MANIFEST_FILE
-    if (path / CHECKPOINT_FILE).is_file():
+    if _has_file(path, CHECKPOINT_FILE):
         raise HyrfFormatError(f"{path}: {describe_unfinished_run(read_run_status(path))}", fix=FINISH_RUN_ADVICE)
+    if not os.access(path, os.X_OK):
+        raise HyrfFormatError(f"{path}: permission to read the folder is denied", fix="check its permissions")
     raise HyrfFormatError(
         f"{path}: this folder holds no {MODEL_FILE}",
         fix="name a .hyrf file, or a folder that 'hyrfpack train' wrote",
@@ -102,8 +105,8 @@ def describe_unfinished_run(run: RunStatus) -> str:
 def read_run_status(folder: str | os.PathLike[str]) -> RunStatus:
     """Read the status of the run in a folder; fields whose file is missing or damaged are None."""
     folder = Path(folder)
-    has_checkpoint = (folder / CHECKPOINT_FILE).is_file()
-    finished = (folder / MODEL_FILE).is_file() and not has_checkpoint
+    has_checkpoint = _has_file(folder, CHECKPOINT_FILE)
+    finished = _has_file(folder, MODEL_FILE) and not has_checkpoint
     if has_checkpoint:
         step, steps = _read_checkpoint_steps(folder / CHECKPOINT_FILE)
         return RunStatus(str(folder), finished, has_checkpoint, step, steps)
@@ -125,6 +128,11 @@ def read_run_status(folder: str | os.PathLike[str]) -> RunStatus:
         psnr_consistent=_get_finite_number(scores, "psnr_consistent"),
         ssim=_get_finite_number(scores, "ssim"),
     )
+
+
+def _has_file(folder: str | os.PathLike[str], name: str) -> bool:
+    """Return whether a folder has a file of this name; False if the folder may not be searched."""
+    return os.path.isfile(os.path.join(folder, name))  # Path.is_file raises if the folder may not be searched
 
 
 def _read_checkpoint_steps(path: Path) -> tuple[int | None, int | None]:

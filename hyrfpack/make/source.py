@@ -15,11 +15,11 @@ from hyrfpack.make.held_out import choose_inner_view
 from hyrfpack.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs, StrPath
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.splats.files import READABLE_ENDINGS
+from hyrfpack.splats.names import SOG_META_NAME, is_sog_folder
 
 MIN_SPLIT_PHOTOS = 16  # if there are fewer photos, a single one is held out
 MIN_HELD_OUT_PHOTOS = 8  # if there are fewer photos, none is held out
 DEFAULT_TEST_EVERY = 8
-_SOG_INDEX_NAME = "meta.json"  # the main file of splats in SOG format that are not packed into one file
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Source:
         if not os.path.lexists(path):
             raise HyrfDataError(f"{path}: no such file or folder", fix="check the path")
         ending = path.suffix.lower()
-        if path.is_file() and (ending == ".hyrf" or ending in READABLE_ENDINGS or path.name == _SOG_INDEX_NAME):
+        if path.is_file() and (ending == ".hyrf" or ending in READABLE_ENDINGS or path.name == SOG_META_NAME):
             return cls(path, "model" if ending == ".hyrf" else "splats")
         if path.is_file() and not (is_archive(path) or ending in VIDEO_SUFFIXES):
             what = "this is one photo" if ending in PICTURE_SUFFIXES else "nothing can be made of this file"
@@ -88,18 +88,17 @@ class Source:
         except HyrfNoPosesError:
             if ending in VIDEO_SUFFIXES and path.is_file():
                 return cls(path, "video")
-            if (path / _SOG_INDEX_NAME).is_file():
+            if is_sog_folder(path):
                 return cls(path, "splats")
             archive, folder = (path, unpack(path)) if is_archive(path) else (None, path)
             return cls(folder / (reading.images or ""), "photos", archive=archive)
         except HyrfDataError:
-            videos = (
-                sorted(p.name for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES) if path.is_dir() else []
-            )
+            names = _list_names(path)
+            videos = [name for name in names or () if Path(name).suffix.lower() in VIDEO_SUFFIXES]
             if videos and not list_photos(path):
                 problem = f"{path}: there are no photos in this folder, but {videos[0]}"
                 raise HyrfDataError(problem, fix="name the video") from None
-            if path.is_dir() and not any(path.iterdir()):
+            if names == []:
                 raise HyrfDataError(f"{path}: the folder is empty", fix="name the one that holds the photos") from None
             raise
 
@@ -116,5 +115,13 @@ class Source:
         if self.kind == "photos":
             folders = sorted({photo.parent for photo in list_photos(self.path)} | {self.path})
             return [Outputs(folder=folder, overwrite=overwrite) for folder in folders]
-        folder = self.path.parent if self.path.name == _SOG_INDEX_NAME else self.path
+        folder = self.path.parent if self.path.name == SOG_META_NAME else self.path
         return [Outputs(self.path, folder=folder, scene=self.scene, overwrite=overwrite)]
+
+
+def _list_names(folder: Path) -> list[str] | None:
+    """Return the sorted names of what is in a folder; None if the path is no folder or cannot be listed."""
+    try:
+        return sorted(os.listdir(folder))
+    except OSError:
+        return None

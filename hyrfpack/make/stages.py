@@ -37,6 +37,7 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Event, StepEvent, TaskEvent
 from hyrfpack.progress.status import StepMeans, format_psnr
 from hyrfpack.scene import Scene
+from hyrfpack.splats.names import SOG_META_NAME
 from hyrfpack.train import Trainer, train_model
 from hyrfpack.train.decisions import measures_length
 from hyrfpack.train.run import is_begun
@@ -240,7 +241,7 @@ def run_import_stage(
     stage_cache: StageCache, source: Path, psnr: float, seed: int, context: RunContext
 ) -> dict[str, Any]:
     """Import splats of another program as `model.hyrf`; return the report of `hyrfpack.import_splats`."""
-    files = sorted(p for p in source.parent.iterdir() if p.is_file()) if source.name == "meta.json" else [source]
+    files = sorted(p for p in source.parent.iterdir() if p.is_file()) if source.name == SOG_META_NAME else [source]
     if source.is_dir():
         files = sorted(p for p in source.iterdir() if p.is_file())
     config = ImportConfig(psnr=psnr, seed=seed)

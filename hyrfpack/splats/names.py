@@ -16,11 +16,11 @@ def is_splats(path: str | os.PathLike[str]) -> bool:
     Such a path ends in one of SPLATS_SUFFIXES, or is the folder or the meta.json of an unbundled SOG.
     """
     path = Path(path)
-    return path.suffix.lower() in SPLATS_SUFFIXES or path.name == SOG_META_NAME or _is_sog_folder(path)
+    return path.suffix.lower() in SPLATS_SUFFIXES or path.name == SOG_META_NAME or is_sog_folder(path)
 
 
-def _is_sog_folder(path: Path) -> bool:
-    """Return whether the folder has a meta.json with positions, as a SOG has; other programs use that name, too."""
+def is_sog_folder(path: Path) -> bool:
+    """Return whether a path is a folder with the meta.json of a SOG; other programs use that name, too."""
     try:
         content = json.loads((path / SOG_META_NAME).read_bytes())
     except (OSError, ValueError, RecursionError):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from denied_access import deny_access
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
@@ -70,6 +71,13 @@ def test_a_missing_folder_is_a_clear_error(tmp_path):
         list_photos(tmp_path / "missing")
     with pytest.raises(HyrfDataError, match="is a file, not a folder"):
         list_photos(save_photo(tmp_path / "1.png"))
+
+
+def test_a_folder_that_may_not_be_read_is_a_clear_error(tmp_path, monkeypatch):
+    save_photo(tmp_path / "locked" / "1.png")
+    deny_access(monkeypatch, tmp_path / "locked")
+    with pytest.raises(HyrfDataError, match=r"the folder cannot be read \(Permission denied\); check its permissions"):
+        list_photos(tmp_path / "locked")
 
 
 @pytest.mark.parametrize(

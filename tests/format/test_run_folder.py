@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from denied_access import deny_access
 from scenes import small_model
 
 import hyrfpack
@@ -58,6 +59,13 @@ def test_another_folder_is_refused_with_what_to_specify(tmp_path):
     with pytest.raises(HyrfFormatError, match="holds no model.hyrf; name a .hyrf file, or a folder that"):
         find_model(tmp_path)
     assert not is_run_folder(tmp_path)
+
+
+def test_a_folder_that_may_not_be_read_is_a_clear_error(run_folder, monkeypatch):
+    deny_access(monkeypatch, run_folder)
+    assert not is_run_folder(run_folder)
+    with pytest.raises(HyrfFormatError, match="permission to read the folder is denied; check its permissions"):
+        find_model(run_folder)
 
 
 def test_an_unfinished_run_is_refused_with_its_step_and_how_to_resume(unfinished_folder):

@@ -9,6 +9,7 @@ import zipfile
 
 import pytest
 from commands import hyrfpack, refused, succeeded
+from denied_access import deny_access
 from PIL import Image
 
 from hyrfpack import load_model, load_scene
@@ -95,6 +96,12 @@ def test_photos_without_poses_may_come_in_an_archive(top, photos, poses, tmp_pat
     assert folder.is_relative_to(tmp_path / "cache") and len(list(folder.rglob("*.png"))) == 18
     assert sum(str(folder) in sentence for sentence in caplog.messages) == 1
     assert len(make_scene(tmp_path / "photos.zip", tmp_path / "scene.hyrf", MakeConfig(quality="draft")).kept) == 5
+
+
+def test_photos_may_lie_beside_a_meta_json_that_is_not_of_splats(photos, poses, tmp_path):
+    (photos / "meta.json").write_text('{"album": "holiday"}')
+    make_scene(photos, tmp_path / "scene.hyrf", MakeConfig(quality="draft"))
+    assert poses == [photos]
 
 
 def test_photos_with_poses_need_no_estimation(posed, poses, tmp_path):
@@ -340,6 +347,12 @@ def test_impossible_requests_are_rejected_before_any_work(posed, photos, finishe
         assert sentence in refused("make", *arguments)
     assert not out.exists() and not (tmp_path / "scene.work").exists()
     assert (tmp_path / "there.html").read_bytes() == b"mine"
+
+
+def test_a_folder_that_may_not_be_read_is_a_clear_error(photos, tmp_path, monkeypatch):
+    deny_access(monkeypatch, photos)
+    with pytest.raises(HyrfError, match="photos: the folder cannot be read .*; check its permissions"):
+        make_scene(photos, tmp_path / "scene.hyrf")
 
 
 def test_a_failed_stage_names_its_folder_and_keeps_finished_stages(posed, tmp_path, monkeypatch):
