@@ -76,6 +76,20 @@ def describe_exception(error: Exception) -> str:
     return f"{type(error).__name__}: {message[:MAX_NOTE_LENGTH]}"
 
 
+def signal_name(code: int) -> str:
+    """Return the name of the signal that ended a process with this exit code, or "" if none did.
+
+    Example:
+        >>> signal_name(-15), signal_name(3)
+        ('SIGTERM', '')
+    """
+    if code >= 0:
+        return ""
+    with suppress(ValueError):  # real-time signals but two have no name
+        return signal.Signals(-code).name
+    return f"signal {-code}"
+
+
 def run_in_children(
     command: Callable[[list[str]], list[str]], items: Sequence[str], seconds: float, item_seconds: float = inf
 ) -> Iterator[Row]:
@@ -163,12 +177,7 @@ class _Child:
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(0.5)  # A process that has closed its output is about to end by itself.
         self._kill()
-        code = self._process.wait()
-        if code >= 0:
-            return ""
-        with suppress(ValueError):
-            return signal.Signals(-code).name
-        return f"signal {-code}"
+        return signal_name(self._process.wait())
 
     def _expire(self) -> None:
         self.is_out_of_time = True

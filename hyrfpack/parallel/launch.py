@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import sys
 from collections.abc import Sequence
 
 from hyrfpack.errors import HyrfError
+from hyrfpack.parallel.child_items import signal_name
 
 _LOG = logging.getLogger(__name__)
 
@@ -59,8 +59,8 @@ def launch(command: Sequence[str], processes: int) -> int:
         if failure.exitcode >= 0:
             return failure.exitcode
         killed = HyrfError(
-            f"process {rank} of {processes} was ended by {signal.Signals(-failure.exitcode).name}, perhaps because "
-            "memory ran out",
+            f"process {rank} of {processes} was ended by {signal_name(failure.exitcode)}, perhaps because memory "
+            "ran out",
             fix="use fewer `processes` or free some memory (files that were written before are kept)",
         )
         if rank == 0:

@@ -13,7 +13,7 @@ from threading import Thread
 from typing import Any
 
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.parallel.child_items import child_environment
+from hyrfpack.parallel.child_items import child_environment, signal_name
 from hyrfpack.progress import Progress, TaskEvent
 
 MAX_SILENCE_SECONDS = 2.0  # the last message is reported again after this time, so that a display keeps counting
@@ -139,7 +139,7 @@ def _crash_error(stage: str, code: int, log: Path) -> StageCrashedError:
             f"{log.parent}: {doing} took more memory than there is",
             fix="close other programs and run the same command again, which resumes here",
         )
-    how = f"by signal {signal.Signals(-code).name}" if code < 0 else f"with code {code}"
+    how = f"by {signal_name(code)}" if code < 0 else f"with code {code}"
     last = next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "it said nothing")
     return StageCrashedError(
         f"{log.parent}: {doing} ended {how} ({last[-160:]})",

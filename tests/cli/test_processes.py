@@ -261,6 +261,13 @@ def test_a_killed_first_process_is_reported(launch_script):
 
 
 @needs_ranks
+@pytest.mark.skipif(not hasattr(signal, "SIGRTMIN"), reason="needs real-time signals")
+def test_a_process_ended_by_a_signal_without_a_name_is_reported(launch_script):
+    code, _ = launch_script(f"test $RANK = 0 && kill -{signal.SIGRTMIN + 6} $$; exec sleep 500")
+    assert f"process 0 of 2 was ended by signal {signal.SIGRTMIN + 6}" in code
+
+
+@needs_ranks
 def test_a_request_to_stop_is_passed_on(launch_script):
     """When both processes listen, the first one sends the signal to the launcher."""
     listening = """trap 'echo $RANK stops; exit 1' TERM; touch "$0.$RANK" """

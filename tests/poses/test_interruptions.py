@@ -163,8 +163,16 @@ def test_poses_in_place_are_completed_after_the_worker_was_killed(photos_and_pos
 def test_a_crash_of_the_library_is_a_clear_error(photos_and_poses, tmp_path, monkeypatch):
     (tmp_path / "sitecustomize.py").write_text(CRASH_AT_STAGE_CODE.format(stage="matches"))
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with pytest.raises(hyrfpack.HyrfError, match="matching photos ended by signal SIGABRT.*run the same command again"):
+    with pytest.raises(hyrfpack.HyrfError, match="matching photos ended by SIGABRT.*run the same command again"):
         hyrfpack.estimate_poses(photos_and_poses[0], tmp_path / "scene")
+
+
+@pytest.mark.integration
+def test_a_signal_without_a_name_is_reported_by_its_number(tmp_path):
+    """Real-time signals have no names in Python, but for the first and the last."""
+    error = process._crash_error("matches", -40, tmp_path / "matches.log")
+    assert "matching photos ended by signal 40 (it said nothing)" in str(error)
+    assert process._crash_error("matches", -signal.SIGABRT, tmp_path / "matches.log").problem.count("by SIGABRT") == 1
 
 
 def test_when_one_mapper_crashes_the_result_of_the_other_is_used_and_noted(
