@@ -141,6 +141,7 @@ def open_picture(path: Path) -> ImageFile:
         _register_heic(path)
         image = Image.open(path)
         if image.format == "EPS":  # PostScript is a program, and Pillow would run it with Ghostscript
+            image.close()
             raise HyrfDataError(f"{shown}: PostScript is not a photo", fix="save it as PNG or JPEG")
     except HyrfError:
         raise
@@ -164,6 +165,7 @@ def open_picture(path: Path) -> ImageFile:
             fix="replace the file",
         ) from error
     if min(image.size) < 1:
+        image.close()
         raise HyrfDataError(
             f"{shown}: the picture has no pixels ({image.size[0]} x {image.size[1]})",
             fix="replace the file",
@@ -224,7 +226,7 @@ def is_tagged_panorama(path: Path) -> bool:
 
 
 def read_pixels(
-    path: Path, size: tuple[int, int] | None = None, orientation: int = 1
+    path: Path, size: tuple[int, int] | None = None, orientation: int = 1, *, as_mask: bool = False
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Decode a photo of any kind: grey, palette, 16 bit, with or without alpha.
 
@@ -233,6 +235,7 @@ def read_pixels(
         size: (width, height) to shrink the photo to, with a Lanczos filter and colours weighted by their alpha; None
             keeps the stored size. JPEG files are decoded at a reduced size if possible, which saves time and memory.
         orientation: EXIF orientation, 1 to 8, by which the picture is turned; `size` is that of the turned picture.
+        as_mask: map all 16-bit values but 0 to 255, instead of scaling them, which rounds small values to 0.
 
     Returns:
         (H, W, 3) uint8 RGB (straight, grey repeated) and (H, W) uint8 alpha or None.
@@ -261,7 +264,8 @@ def read_pixels(
                 image.filename = ""  # otherwise Pillow maps the file into memory with width and height exchanged
             if image.mode in _SIXTEEN_BIT_MODES:
                 values = np.asarray(image).astype(np.float64)
-                picture = Image.fromarray((np.clip(values, 0, 65535) / 257 + 0.5).astype(np.uint8))
+                levels = np.where(values != 0, 255, 0) if as_mask else np.clip(values, 0, 65535) / 257 + 0.5
+                picture = Image.fromarray(levels.astype(np.uint8))
             else:
                 picture = image.convert("RGBA" if _has_alpha(image) else "RGB")
             if applied != 1:
@@ -298,7 +302,7 @@ def read_mask(path: Path, height: int, width: int, *, require_all: bool = False,
     Returns:
         (height, width) bool, True for usable pixels.
     """
-    rgb, _ = read_pixels(path, orientation=orientation)
+    rgb, _ = read_pixels(path, orientation=orientation, as_mask=True)
     usable = np.any(rgb, axis=2)
     if usable.shape == (height, width):
         return usable

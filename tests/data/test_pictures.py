@@ -168,6 +168,24 @@ def test_mask_is_resized_by_nearest_neighbour(tmp_path):
     np.testing.assert_array_equal(mask, np.kron([[0, 1], [1, 0]], np.ones((2, 2))).astype(bool))
 
 
+@pytest.mark.parametrize("ending", ["png", "tif"])
+def test_every_16_bit_value_but_0_of_a_mask_is_usable(tmp_path, ending):
+    values = np.array([[0, 1, 128], [129, 255, 65535]], np.uint16)
+    Image.fromarray(values).save(tmp_path / f"m.{ending}")
+
+    np.testing.assert_array_equal(read_mask(tmp_path / f"m.{ending}", 2, 3), values > 0)
+
+
+def test_a_refused_picture_is_closed(tmp_path, monkeypatch):
+    opened, usual = [], Image.open
+    monkeypatch.setattr(Image, "open", lambda path: opened.append(usual(path)) or opened[-1])
+    Image.new("L", (8, 8)).save(tmp_path / "a.png", "EPS")
+
+    with pytest.raises(HyrfDataError, match="PostScript is not a photo"):
+        read_header(tmp_path / "a.png")
+    assert opened[0].fp is None
+
+
 @pytest.mark.parametrize(("width", "height", "same"), [(100, 67, True), (99, 66, True), (67, 100, False)])
 def test_aspect_tolerates_rounding_only(width, height, same):
     assert has_same_aspect(width, height, 800, 533) is same
