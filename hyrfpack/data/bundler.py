@@ -142,7 +142,8 @@ def _read_bundle(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     needed = 1 + 5 * cameras + 3 * points
     if cameras < 1 or points < 0 or len(lines) < needed:
         raise HyrfDataError(
-            f"{file}: {cameras} cameras and {points} points take {needed} lines, but there are {len(lines)}",
+            f"{file}: {format_count(cameras, 'camera')} and {format_count(points, 'point')} take {needed:,} lines, "
+            f"but there are {len(lines):,}",
             fix="the file is truncated, export it again",
         )
     first = 1 + 5 * cameras

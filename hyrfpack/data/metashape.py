@@ -184,8 +184,9 @@ def _choose_frame(chunk: Element, table: Path) -> tuple[_Frame, str | None, list
     ids = Counter(c.get("component_id") for c in _cameras(chunk) if c.find("transform") is not None)
     component = max((key for key in ids if key is not None), key=lambda key: ids[key], default=None)
     notes = []
-    if sum(key is not None for key in ids) > 1:
-        notes.append(f"there are {len(ids)} components; the one with the most cameras ({ids[component]}) is used")
+    count = sum(key is not None for key in ids)
+    if count > 1:
+        notes.append(f"there are {count} components; the one with the most cameras ({ids[component]}) is used")
     elements = [c for c in chunk.iterfind("components/component") if c.get("id") == component]
     transform = next((e.find("transform") for e in (*elements, chunk) if e.find("transform") is not None), None)
     if transform is None or transform.find("rotation") is None:

@@ -109,6 +109,10 @@ def rewrite(root, change) -> None:
     [
         (lambda root: rewrite(root, lambda text: text[:500]), "is truncated"),
         (lambda root: rewrite(root, lambda text: text.replace("4 4\n", "4 400000000000\n")), "is truncated"),
+        (
+            lambda root: rewrite(root, lambda text: "# Bundle file v0.3\n1 1\n"),
+            "1 camera and 1 point take 9 lines, but",
+        ),
         (lambda root: rewrite(root, lambda text: text.replace("4 4\n", "many\n")), "how many cameras"),
         (lambda root: rewrite(root, lambda text: text.replace("4 4\n", "-1 4\n")), "is truncated"),
         (lambda root: rewrite(root, lambda text: text.replace("6.8458150610e+02", "nan")), "not finite"),

@@ -180,15 +180,17 @@ def test_cameras_without_a_pose_are_skipped(tmp_path, pictures):
 
 
 def test_the_largest_component_is_used(tmp_path, pictures):
-    pictures(tmp_path, ["a.jpg", "b.jpg", "c.jpg"])
+    """A camera without a component is used with any, and is none of its own."""
+    pictures(tmp_path, ["a.jpg", "b.jpg", "c.jpg", "d.jpg"])
     pose = "1 0 0 {} 0 1 0 0 0 0 1 0 0 0 0 1"
-    cameras = "".join(camera(name, pose.format(i), i) for i, name in enumerate("abc"))
+    cameras = "".join(camera(name, pose.format(i), i) for i, name in enumerate("abcd"))
     cameras = cameras.replace('component_id="0" label="c"', 'component_id="1" label="c"')
+    cameras = cameras.replace('component_id="0" label="d"', 'label="d"')
     (tmp_path / "cameras.xml").write_text(document(cameras, size=(32, 24), calibration="<f>30</f>"))
 
     scene = load_scene(tmp_path)
 
-    assert len(scene.views) == 2 and any("there are 2 components" in note for note in scene.notes)
+    assert len(scene.views) == 3 and any("there are 2 components" in note for note in scene.notes)
 
 
 def test_other_xml_files_are_ignored(tmp_path, nerfstudio_folder):
