@@ -6,7 +6,7 @@ import hashlib
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -41,6 +41,7 @@ _COPYING_TASK = "copying photos"
 COPY_REASON_PREFIX = "a copy of"  # the reason for leaving out a copy begins with these words
 
 Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -96,9 +97,7 @@ def read_headers(
     taken = {path.relative_to(root).as_posix() for path in files}  # names that faces and rewritten photos must not get
     first_with: dict[tuple[int, str], str] = {}
     sizes = Counter(path.stat().st_size for path in files)
-    with ThreadPoolExecutor(thread_count()) as pool:
-        reading = pool.map(_read_facts_or_reason, files)
-        found = list(_report_counts(reading, progress, "reading the headers of photos", len(files)))
+    found = _map_on_threads(_read_facts_or_reason, files, progress, "reading the headers of photos", len(files))
     for path, facts in zip(files, found, strict=True):
         source = path.relative_to(root).as_posix()
         shown_name = os.fsencode(source).decode("utf-8", "backslashreplace")
@@ -196,9 +195,7 @@ def make_images(photos: Sequence[Photo], folder: Path, progress: Progress = igno
     for parent in {(folder / photo.name).parent for photo in photos}:
         parent.mkdir(parents=True, exist_ok=True)
     whole = [photo for photo in photos if photo.face is None]
-    with ThreadPoolExecutor(thread_count()) as pool:
-        writing = pool.map(lambda photo: _write_photo(photo, folder / photo.name), whole)
-        list(_report_counts(writing, progress, _COPYING_TASK, len(photos)))
+    _map_on_threads(lambda photo: _write_photo(photo, folder / photo.name), whole, progress, _COPYING_TASK, len(photos))
     panoramas = {photo.facts.path: (folder / photo.name).parent for photo in photos if photo.face}
     for number, (path, target_folder) in enumerate(panoramas.items(), start=1):
         cut_panorama(path, target_folder)
@@ -278,11 +275,20 @@ def _is_panorama_or_reason(path: Path) -> bool | str:
         return strip_path(error, display_path(path))
 
 
-def _report_counts(items: Iterable[Item], progress: Progress, task: str, count: int) -> Iterator[Item]:
-    """Yield the items and report how many of `count` were yielded so far."""
-    for number, item in enumerate(items, start=1):
-        progress(_count_event(task, number, count))
-        yield item
+def _map_on_threads(
+    function: Callable[[Item], Result], items: Sequence[Item], progress: Progress, task: str, count: int
+) -> list[Result]:
+    """Call a function for each item on threads and report how many of `count` are done; return the results in order."""
+    results = []
+    with ThreadPoolExecutor(thread_count()) as pool:
+        try:
+            for number, result in enumerate(pool.map(function, items), start=1):
+                progress(_count_event(task, number, count))
+                results.append(result)
+        except BaseException:  # such as a stop, which `progress` raises
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return results
 
 
 def _count_event(task: str, done: int, count: int) -> TaskEvent:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from hyrfpack.poses.prepare import (
     make_masks,
     read_headers,
 )
-from hyrfpack.progress import ignore_progress
+from hyrfpack.progress import TaskEvent, ignore_progress
 
 # EXIF orientation -> counter-clockwise quarter turns from the upright picture to the stored one.
 QUARTER_TURNS_BY_ORIENTATION = {3: 2, 6: 1, 8: 3}
@@ -66,6 +67,26 @@ def test_photos_stored_on_their_side_are_written_upright(orientation, name, writ
     with Image.open(tmp_path / "out" / written) as image:
         assert image.getexif().get(0x0112, 1) == 1
         assert np.abs(np.asarray(image).astype(float) - upright_picture()).mean() <= most
+
+
+def test_a_stop_leaves_photos_that_were_not_begun_unread(tmp_path, monkeypatch):
+    read: list[Path] = []
+
+    def read_slowly(path: Path) -> str:
+        read.append(path)
+        time.sleep(0.02)
+        return "unreadable"
+
+    def stop(event: TaskEvent) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hyrfpack.poses.prepare._read_facts_or_reason", read_slowly)
+    files = [tmp_path / f"{number}.jpg" for number in range(50)]
+    for file in files:
+        file.touch()
+    with pytest.raises(KeyboardInterrupt):
+        read_headers(tmp_path, files, in_place=False, progress=stop)
+    assert len(read) < len(files)
 
 
 def test_upright_photos_are_copied_byte_for_byte_and_stay_independent(tmp_path):
