@@ -21,6 +21,12 @@ PREVIEW_FILE = "preview.hyrf"
 _TRAINED_FILE = "preview.raw.hyrf"  # the model before it is compressed
 
 
+def remove_preview(stage_cache: StageCache) -> None:
+    """Remove the preview of an earlier call once the training is finished."""
+    with suppress(OSError):
+        (stage_cache.folder / PREVIEW_FILE).unlink(missing_ok=True)
+
+
 def write_preview(stage_cache: StageCache, trainer: Trainer, context: RunContext) -> Path | None:
     """Compress the model of an interrupted run into `preview.hyrf` in the work folder.
 

@@ -29,6 +29,7 @@ from hyrfpack.make.plan import (
     expected_photo_size,
     find_quality,
 )
+from hyrfpack.make.preview import remove_preview
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.request import Request, default_work_folder
 from hyrfpack.make.source import LoadSettings, Source
@@ -222,6 +223,7 @@ class _Pipeline:
         training = stages.run_training_stage(
             stage_cache, scene, self._scene_digest(scene), plan, request.config.seed, request.observer, self.context
         )
+        remove_preview(stage_cache)
         if self.owns_cache:
             self.cache.clear()  # compression needs the memory more than the photos
         stages.run_compression_stage(stage_cache, scene, plan, self.context)

@@ -18,6 +18,7 @@ from hyrfpack.config.make import MakeConfig
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.make import Stopped, make_scene, stages
+from hyrfpack.make.preview import PREVIEW_FILE
 from hyrfpack.make.stage_cache import interruptible
 from hyrfpack.progress import StageEvent, StepEvent
 
@@ -208,6 +209,17 @@ def test_a_kill_at_any_report_loses_no_finished_work(uninterrupted_products, pos
             assert steps == [f"step {step}/9" for step in range(int(match[1]) + 1, 10)]
         assert read_products(again.work) == uninterrupted_products
     assert {event.stage for event, _ in killed} == set(STAGE_FUNCTIONS)
+
+
+def test_the_preview_of_an_interrupted_training_is_removed_when_the_training_is_finished(posed, tmp_path, monkeypatch):
+    def stop(event: StageEvent) -> None:
+        if event.details[:1] == ("step 5/9",):
+            raise KeyboardInterrupt
+
+    with pytest.raises(Stopped):
+        make_scene(posed, tmp_path / "scene.html", context=RunContext(progress=stop))
+    (tmp_path / "scene.work" / PREVIEW_FILE).write_bytes(b"the scene at step 5")
+    assert not (make_scene(posed, tmp_path / "scene.html").work / PREVIEW_FILE).exists()
 
 
 def test_an_interrupted_training_is_not_resumed_with_other_settings(posed, tmp_path):
