@@ -218,7 +218,7 @@ class _Pipeline:
             for sentence in scene.notes:
                 _LOG.info(sentence)
         plan, scene = self._decide_plan(path, reading, scene)
-        if request.config.minutes is None:
+        if request.config.minutes is None or "measurement" in stage_cache.kept:
             self.reporter.estimates |= estimate_scene_seconds(scene, plan, request.device)
         training = stages.run_training_stage(
             stage_cache, scene, self._scene_digest(scene), plan, request.config.seed, request.observer, self.context

@@ -11,13 +11,14 @@ import torch
 
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.train import FULL_STEPS
+from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache, load_scene
 from hyrfpack.make import make_scene, minutes
 from hyrfpack.make.minutes import SceneCost, fit_plan_to_minutes
 from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.source import LoadSettings
-from hyrfpack.progress import ignore_progress
+from hyrfpack.progress import StageEvent, ignore_progress
 from hyrfpack.train import decisions
 
 
@@ -210,3 +211,16 @@ def test_the_measured_cost_is_kept_by_the_next_call(posed, tmp_path, monkeypatch
     assert list(first.seconds)[0] == "measurement"
     monkeypatch.setattr(minutes, "measure_scene_cost", None)
     assert "measurement" in make_scene(posed, tmp_path / "scene.ply", MakeConfig(minutes=0.01)).kept
+
+
+@pytest.mark.usefixtures("fake_stages")
+def test_with_a_kept_measurement_the_remaining_time_is_estimated_again(posed, tmp_path, monkeypatch):
+    make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(minutes=0.01))
+    (tmp_path / "scene.work" / "run" / "model.hyrf").unlink()
+    parts = ("pilots", "training", "results", "compression", "scoring", "export")
+    monkeypatch.setattr("hyrfpack.make.run.estimate_scene_seconds", lambda *_: dict.fromkeys(parts, 1234.0))
+    events: list[StageEvent] = []
+    context = RunContext(progress=events.append)
+    assert make_scene(posed, tmp_path / "scene.ply", MakeConfig(minutes=0.01), context=context).kept[0] == "measurement"
+    first = next(event for event in events if event.stage == "training")
+    assert first.seconds_left is not None and first.seconds_left >= 1234
