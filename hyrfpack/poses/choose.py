@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from hyrfpack.counts import format_count
 from hyrfpack.poses.alignment import Poses, align_poses
 
 _MAPPER_NAMES = {"incremental": "the incremental mapper", "global": "the global mapper"}
@@ -96,7 +97,7 @@ def describe_doubt(poses: Poses, other: Candidate | None) -> str:
     lacking = len(set(poses).difference(other.poses, *other.other_pieces))
     in_other_pieces = len(set().union(*other.other_pieces).intersection(poses).difference(agreed))
     unlike = len(poses) - len(agreed) - lacking - in_other_pieces
-    parts = [f"gives {unlike} photos other poses"] if unlike > 0 else []
+    parts = [f"gives {format_count(unlike, 'photo')} other poses"] if unlike > 0 else []
     parts += [f"has {in_other_pieces} in other pieces"] if in_other_pieces else []
     parts += [f"has no pose for {lacking}"] if lacking else []
     return (

@@ -84,8 +84,11 @@ def check_matches(folder: Path, count: int, matches: Mapping[str, Any]) -> None:
         HyrfDataError: the photos do not overlap, or were all taken from one place.
     """
     if len(matches["matched"]) < MIN_PHOTOS:
+        pairs = format_count(
+            matches["pairs"], f"pair of these {count} photos shows", f"pairs of these {count} photos show"
+        )
         raise HyrfDataError(
-            f"{folder}: {matches['pairs'] or 'no'} pairs of these {count} photos show the same thing",
+            f"{folder}: {pairs} the same thing",
             fix="take sharp photos of one scene, each sharing two thirds of its view with the next",
         )
     if matches["turned"] >= _MIN_PANORAMA_PAIR_RATIO:

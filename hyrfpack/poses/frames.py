@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from hyrfpack.atomic import make_folder, write_atomic
+from hyrfpack.counts import format_count
 from hyrfpack.data.quality import is_blurred, measure_sharpness
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.outputs import StrPath
@@ -175,7 +176,8 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
     sharp: list[float] = []
     thumbnails: list[np.ndarray] = []
     notes: list[str] = []
-    decoded_count, repeated_count, time, interlaced, last = 0, 0, 0.0, False, -np.inf
+    decoded_count, repeated_count, time, last = 0, 0, 0.0, -np.inf
+    interlaced = changes_size = False
     for number, time, frame in video.frames():
         decoded_count = number + 1
         interlaced = interlaced or bool(frame.interlaced_frame)
@@ -187,6 +189,7 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
         size = (max(8, round(gray.shape[1] * scale)), max(8, round(gray.shape[0] * scale)))
         thumbnail = np.asarray(Image.fromarray(gray).resize(size, Image.Resampling.BOX))
         if thumbnails and thumbnails[-1].shape != thumbnail.shape:
+            changes_size = True
             notes.append(f"the picture changes its size after {time:.0f} s; what follows was not used")
             break
         if thumbnails and np.abs(thumbnail.astype(np.int16) - thumbnails[-1]).mean() < _MAX_REPEAT_DIFFERENCE_LEVELS:
@@ -204,10 +207,10 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
             (" that can be decoded", "copy it again in full, or ") if video.damaged_count else ("", "")
         )
         raise HyrfDataError(
-            f"{path}: the video has only {decoded_count} frames{can_be_decoded}",
+            f"{path}: the video has only {format_count(decoded_count, 'frame')}{can_be_decoded}",
             fix=f"{copy_or}film for at least ten seconds",
         )
-    if video.damaged_count or time < _MIN_DURATION_RATIO * video.seconds:
+    if not changes_size and (video.damaged_count or time < _MIN_DURATION_RATIO * video.seconds):
         notes.append(
             f"the video is damaged or cut off: {decoded_count} frames of {time:.1f} s could be read, of "
             f"{video.seconds:.1f} s that it should have; copy it again if there is more"

@@ -88,7 +88,7 @@ def test_photos_without_features_are_a_clear_error(tmp_path):
 def test_photos_without_overlap_are_a_clear_error(tmp_path):
     photos = save_pictures(tmp_path / "photos", random_pictures(6))
     sentence = refused("poses", photos, "-o", tmp_path / "scene")
-    assert "no pairs of these 6 photos show the same thing" in sentence
+    assert "0 pairs of these 6 photos show the same thing" in sentence
     assert (tmp_path / "scene" / ".poses" / "database.db").is_file()
 
 

@@ -43,6 +43,10 @@ def test_disagreement_of_the_mappers_is_noted_and_agreement_is_not():
     assert describe_doubt(poses, make_candidate("global", transform_poses(poses), 1000)) == ""
     said = describe_doubt(poses, make_candidate("global", transform_poses(folded), 800))
     assert said.startswith("16 of 24 poses are confirmed by both mappers; the global mapper gives 8 photos other poses")
+    nearly = circle_poses(6)
+    turned = {**nearly, "x": nearly[min(nearly)]}
+    nearly["x"] = nearly[max(nearly)]
+    assert "gives 1 photo other poses" in describe_doubt(nearly, make_candidate("global", transform_poses(turned), 800))
     lacking = {name: poses[name] for name in names[:10]}
     assert "has no pose for 14" in describe_doubt(poses, make_candidate("incremental", transform_poses(lacking), 400))
     assert "the poses of these 24 photos are not confirmed" in describe_doubt(poses, None)

@@ -20,6 +20,7 @@ from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.poses.frames import RECORD_NAME, choose_frames, frame_times, is_video
 from hyrfpack.poses.hdr import HLG_TRANSFER, PQ_TRANSFER, tone_map_to_srgb
 from hyrfpack.poses.motion import motion_distances, track_windows
+from hyrfpack.poses.video import Video
 from hyrfpack.progress import TaskEvent, ignore_progress
 
 av = pytest.importorskip("av")
@@ -194,6 +195,19 @@ def test_a_truncated_video_gives_its_frames_and_a_note(wall, tmp_path):
     assert any("cut off" in note for note in report.notes)
 
 
+def test_a_video_that_changes_its_size_is_not_called_damaged(wall, tmp_path, monkeypatch):
+    def resized_frames(video):
+        for number, time, frame in usual_frames(video):
+            yield number, time, frame if number < 60 else frame.reformat(width=FRAME_HEIGHT, height=FRAME_WIDTH)
+
+    usual_frames = Video.frames
+    monkeypatch.setattr(Video, "frames", resized_frames)
+    video = write_video(tmp_path / "clip.mkv", [crop_wall(wall, 4.0 * number) for number in range(120)])
+    assert choose_frames(video, tmp_path / "frames").notes == (
+        "the picture changes its size after 2 s; what follows was not used",
+    )
+
+
 def test_a_damaged_video_gives_the_frames_that_can_be_decoded(wall, tmp_path):
     video = write_video(tmp_path / "clip.mkv", [crop_wall(wall, 4.0 * number) for number in range(120)])
     data = bytearray(video.read_bytes())
@@ -215,6 +229,7 @@ def test_a_video_without_usable_frames_is_a_clear_error(wall, tmp_path):
     whole = write_video(tmp_path / "whole.mp4", moving)
     out = tmp_path / "frames"
     assert "only 3 frames" in frame_error(write_video(tmp_path / "three.mp4", moving[:3]), out)
+    assert "only 1 frame;" in frame_error(write_video(tmp_path / "one.mp4", moving[:1]), out)
     assert "hardly moves" in frame_error(write_video(tmp_path / "still.mp4", [moving[0]] * 60), out)
     flat = [np.full((FRAME_HEIGHT, FRAME_WIDTH, 3), 90, np.uint8)] * 30
     assert "blurred" in frame_error(write_video(tmp_path / "flat.mp4", flat), out)
