@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -167,25 +166,18 @@ def cut_face(panorama: np.ndarray, face: Face, size: int) -> np.ndarray:
     return (above * (1 - b) + below * b + 0.5).astype(np.uint8)
 
 
-def cut_panorama(
-    path: str | os.PathLike[str],
-    folder: str | os.PathLike[str],
-    *,
-    size: int | None = None,
-    faces: Sequence[Face] = CUBE_FACES,
-) -> list[Path]:
-    """Write the faces of a panorama as JPEG files, "pano_front.jpg" and so on, for structure-from-motion.
+def cut_panorama(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> list[Path]:
+    """Write the six faces of a panorama as JPEG files, "pano_front.jpg" and so on, for structure-from-motion.
 
-    All faces share the lens `face_lens(size)` and the centre of projection; CUBE_FACES has their rotations.
+    All faces share the centre of projection and the lens `face_lens(size)` with the `face_size` of the panorama;
+    CUBE_FACES has their rotations.
 
     Args:
         path: the panorama.
         folder: folder to write into; created if it is missing. Existing files of these names are replaced.
-        size: side of each face in pixels; None takes `face_size` of the panorama.
-        faces: the faces to write.
 
     Returns:
-        Paths of the files, in the order of `faces`.
+        Paths of the files, in the order of CUBE_FACES.
 
     Raises:
         HyrfDataError: the file cannot be read, or is not twice as wide as high.
@@ -199,14 +191,14 @@ def cut_panorama(
         ['street_front.jpg', 'street_right.jpg']
     """
     path = Path(path)
-    width = panorama_lens(path, read_header(path)).width
+    size = face_size(panorama_lens(path, read_header(path)).width)
     rgb, _ = read_pixels(path)
     written = []
-    for face in faces:
+    for face in CUBE_FACES:
         from PIL import Image
 
         file = Path(folder, f"{path.stem}_{face.name}.jpg")
-        picture = Image.fromarray(cut_face(rgb, face, size or face_size(width)))
+        picture = Image.fromarray(cut_face(rgb, face, size))
         with replace_file(file) as temporary:
             picture.save(temporary, "JPEG", quality=_JPEG_QUALITY, subsampling=0)
         written.append(file)

@@ -43,12 +43,11 @@ class Exposure:
     bright: float
 
 
-def read_gray(path: StrPath, size: int = MEASURED_SIDE_PIXELS) -> np.ndarray:
-    """Decode a photo as luma, shrunk to at most `size` pixels on the longer side.
+def read_gray(path: StrPath) -> np.ndarray:
+    """Decode a photo as luma, shrunk to at most MEASURED_SIDE_PIXELS on the longer side.
 
     Args:
         path: the photo.
-        size: largest length of the longer side in pixels.
 
     Returns:
         (H, W) float32 in [0, 1], display-referred; transparent pixels are composited over black.
@@ -57,12 +56,14 @@ def read_gray(path: StrPath, size: int = MEASURED_SIDE_PIXELS) -> np.ndarray:
         HyrfDataError: the file is missing, truncated, or no picture.
 
     Example:
-        >>> read_gray("photos/bonsai/images/0000.png", 24).shape
-        (24, 24)
+        >>> from PIL import Image
+        >>> Image.new("RGB", (1600, 900)).save("wide.png")
+        >>> read_gray("wide.png").shape
+        (450, 800)
     """
     path = Path(path)
     stored = read_header(path).size
-    wanted = fit_size(*stored, size)
+    wanted = fit_size(*stored, MEASURED_SIDE_PIXELS)
     rgb, alpha = read_pixels(path, None if wanted == stored else wanted)
     gray = rgb @ (_LUMA_WEIGHTS / 255)
     return gray if alpha is None else gray * (alpha * np.float32(1 / 255))

@@ -17,10 +17,10 @@ from hyrfpack.data.quality import is_blurred, measure_sharpness
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.outputs import StrPath
 from hyrfpack.poses.motion import TRACKING_SIDE_PIXELS, motion_distances, track_windows
-from hyrfpack.poses.video import Video, decode_gray, decode_upright, is_video, open_video
+from hyrfpack.poses.video import Video, decode_gray, decode_upright, open_video
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress
 
-__all__ = ["FrameReport", "choose_frames", "is_video", "survey_frames"]
+__all__ = ["FrameReport", "choose_frames", "survey_frames"]
 
 
 RECORD_NAME = "frames.json"  # this file beside the frames states their video and settings
@@ -32,6 +32,7 @@ _MAX_MATCHABLE_SPACING_RATIO = 0.15  # matching begins to fail beyond this spaci
 _TARGET_FRAMES = 60  # in slow videos the spacing is reduced until this number is reached
 _MIN_DECODED_FRAMES = 10
 _MIN_TAKEN_FRAMES = 5
+_DEFAULT_MAX_TAKEN_FRAMES = 150
 _SHARPNESS_SIDE_PIXELS = 640  # longer side of the pictures whose sharpness is measured
 # Measuring more frames than this takes time and does not improve the choice.
 _MAX_MEASURED_FRAMES_PER_SECOND = 30.5
@@ -92,7 +93,7 @@ class _VideoMeasurement:
 
 
 def choose_frames(
-    video: StrPath, folder: StrPath, *, most: int = 150, progress: Progress = ignore_progress
+    video: StrPath, folder: StrPath, *, most: int = _DEFAULT_MAX_TAKEN_FRAMES, progress: Progress = ignore_progress
 ) -> FrameReport:
     """Choose sharp, evenly spaced frames of a video and write them as photos.
 
@@ -141,13 +142,11 @@ def choose_frames(
     return FrameReport(**{**record["report"], "notes": tuple(record["report"]["notes"])})
 
 
-def survey_frames(
-    video: StrPath, *, most: int = 150, progress: Progress = ignore_progress
-) -> tuple[FrameReport, tuple[int, int], int]:
-    """Measure a video and report which frames `choose_frames` would take, without writing any file.
+def survey_frames(video: StrPath, progress: Progress = ignore_progress) -> tuple[FrameReport, tuple[int, int], int]:
+    """Measure a video and report which frames `choose_frames` would take by default, without writing any file.
 
     Args:
-        video, most, progress: see `choose_frames`.
+        video, progress: see `choose_frames`.
 
     Returns:
         The report, the (width, height) of the stored frames, and the number of measured frames.
@@ -162,7 +161,7 @@ def survey_frames(
     with open_video(video) as source:
         measured = _measure_video(video, source, progress)
         return (
-            _choose_spaced_frames(video, measured, most, progress)[1],
+            _choose_spaced_frames(video, measured, _DEFAULT_MAX_TAKEN_FRAMES, progress)[1],
             source.size,
             len(measured.numbers) + measured.repeated_count,
         )

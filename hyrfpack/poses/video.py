@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError, needs_package
-from hyrfpack.outputs import VIDEO_SUFFIXES, StrPath
 from hyrfpack.poses.hdr import HLG_TRANSFER, PQ_TRANSFER, tone_map_to_srgb
 
 if TYPE_CHECKING:
@@ -20,16 +19,6 @@ _MIN_REC709_LINES = 720  # videos without a colour tag are read as Rec. 709 from
 # Numbers of colour matrices in ITU-T H.273.
 _H273_UNSPECIFIED = 2
 _H273_REC709 = 1
-
-
-def is_video(path: StrPath) -> bool:
-    """Return whether a file name has the ending of a video (.mp4, .mov, .mkv, .webm and so on, in any case).
-
-    Example:
-        >>> is_video("clip.MOV"), is_video("photo.jpg")
-        (True, False)
-    """
-    return str(path).lower().endswith(VIDEO_SUFFIXES)
 
 
 class Video:

@@ -17,7 +17,7 @@ from scipy import ndimage
 import hyrfpack
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.poses.frames import RECORD_NAME, choose_frames, frame_times, is_video
+from hyrfpack.poses.frames import RECORD_NAME, choose_frames, frame_times
 from hyrfpack.poses.hdr import HLG_TRANSFER, PQ_TRANSFER, tone_map_to_srgb
 from hyrfpack.poses.motion import motion_distances, track_windows
 from hyrfpack.poses.video import Video
@@ -264,11 +264,6 @@ def test_without_pyav_the_error_names_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(HyrfError, match=r"pip install \"hyrfpack\[video\]\""):
         choose_frames(tmp_path / "clip.mp4", tmp_path / "frames")
-
-
-def test_videos_are_recognised_by_their_endings():
-    assert all(is_video(name) for name in ("a.mp4", "b.MOV", Path("c.webm")))
-    assert not any(is_video(name) for name in ("a.jpg", "mp4", "a.ply"))
 
 
 @pytest.mark.parametrize(

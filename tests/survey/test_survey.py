@@ -225,7 +225,7 @@ def test_info_of_a_file_that_is_no_photo_is_a_clear_error(tmp_path):
         assert sentence in refused("info", tmp_path / name)
 
 
-@pytest.mark.parametrize("name", ["data.quality", "survey.describe", "poses.frames", "poses.video"])
+@pytest.mark.parametrize("name", ["data.quality", "survey.describe", "poses.frames"])
 def test_the_examples_of_these_modules_run(name, data, tmp_path, monkeypatch):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "bonsai").symlink_to(data)
