@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import logging
 import os
 import re
 
@@ -59,7 +60,8 @@ def test_the_page_contains_the_file_and_its_metadata(model_file, tmp_path):
     assert (report.views, report.psnr, report.psnr_baked, report.chosen_by) == (0, None, None, {})
 
 
-def test_names_that_are_not_valid_utf8_become_escapes_in_titles(model_file, tmp_path):
+def test_names_that_are_not_valid_utf8_become_escapes_in_titles(model_file, tmp_path, caplog):
+    caplog.set_level(logging.CRITICAL, "hyrfpack")  # pytest's processes send each other the log in UTF-8
     name = os.fsdecode(b"caf\xe9")
     copy = tmp_path / f"{name}.hyrf"
     try:
