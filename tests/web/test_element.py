@@ -150,6 +150,19 @@ def test_a_frame_follows_the_camera_without_entries_in_the_history(browser: Brow
     assert browser.evaluate("history.length === entries")
 
 
+def test_a_frame_stays_at_the_page_that_a_link_in_it_opens(browser: Browser, host: Site):
+    host.files["/list.html"] = b"<!DOCTYPE html><title>list</title>"
+    open_element(browser, host, 'src="cloud.spz" camera="0,0,3,0,0,0,0,1,0" frame')
+    wait_until(browser, LOADED_JS)
+    frame = f"{ELEMENT_JS}.shadowRoot.querySelector('iframe')"
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('camera', '1,0,3,0,0,0,0,1,0')")
+    wait_until(browser, f"{frame}.contentWindow.location.hash.startsWith('#camera=1,')")
+    browser.evaluate(f"{frame}.contentWindow.location.href = '/list.html', 0")
+    wait_until(browser, f"{frame}.contentDocument?.title === 'list'")
+    browser.evaluate("new Promise((done) => setTimeout(done, 300))")
+    assert browser.evaluate(f"{frame}.contentDocument.title") == "list"
+
+
 def test_an_element_without_src_shows_nothing_and_waits(browser: Browser, host: Site):
     open_element(browser, host, "")
     browser.evaluate("new Promise((done) => setTimeout(done, 50))")

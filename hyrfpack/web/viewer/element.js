@@ -50,6 +50,7 @@ class HyrfViewerElement extends (globalThis.HTMLElement ?? class {}) {
   }
 
   connectedCallback() {
+    this.view?.reconnect?.();
     this.schedule();
   }
 

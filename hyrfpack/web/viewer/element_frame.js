@@ -15,6 +15,7 @@ export class FrameView {
     this.element = element;
     this.frame = null;
     this.address = "";
+    this.isMoved = false;
     this.receiveMessage = this.receiveMessage.bind(this);
     addEventListener("message", this.receiveMessage);
   }
@@ -58,20 +59,26 @@ export class FrameView {
     const before = this.address;
     this.address = href;
     if (href === before) return;
-    if (hash && withoutHash(href) === withoutHash(before)) return this.turn();
+    if (hash && withoutHash(href) === withoutHash(before)) return this.replaceAddress();
     this.removeFrame();
     this.isAnswered = false;
     this.frame = document.createElement("iframe");
     this.frame.allow = "fullscreen; clipboard-write; web-share";
     this.frame.src = href;
     this.frame.onload = () => {
-      if (this.frame.src !== this.address) this.turn(); // to the newest camera, after an element was moved in its page
+      if (this.isMoved && this.frame.src !== this.address) this.replaceAddress(); // with that of the newest camera
+      this.isMoved = false;
       if (!this.isAnswered) this.timer = setTimeout(() => this.fail(this.noPlayerText()), ANSWER_MS);
     };
     this.element.shadowRoot.append(this.frame);
   }
 
-  turn() {
+  // An element that is moved in its page keeps its view, but its frame loads again.
+  reconnect() {
+    this.isMoved = true;
+  }
+
+  replaceAddress() {
     this.frame.contentWindow.location.replace(this.address);
   }
 
