@@ -90,6 +90,8 @@ def test_invalid_inputs_of_import_are_a_clear_error(source: Path, tmp_path: Path
     target = tmp_path / "x.hyrf"
     assert "nothing.ply" in refused("import", tmp_path / "nothing.ply", "-o", target)
     assert "name another file" in refused("import", source, "-o", source)
+    both = refused("import", source, "-o", target, "--psnr", 37, "--target-size", "20kB")
+    assert "--psnr and --target-size each decide how large the file is; give one of them" in both
     (tmp_path / "broken.ply").write_bytes(source.read_bytes()[:-7])
     assert "broken.ply" in refused("import", tmp_path / "broken.ply", "-o", target)
     assert "JSON" in refused("import", source, "-o", target, "--cameras", source)
