@@ -89,7 +89,7 @@ class Setting:
         if self.kind is bool:
             check_bool(self.name, value)
         elif self.kind is str and not isinstance(value, str):
-            raise ValueError(f"{self.name} is {value!r}; it must be a text")
+            raise ValueError(f"{self.name} is {value!r}; it must be a string")
         elif isinstance(self.limits, OneOf):
             check_choice(self.name, value, self.limits.words)
         elif isinstance(self.limits, Range) and self.kind is int:

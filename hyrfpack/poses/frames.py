@@ -209,7 +209,7 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
             f"{path}: the video has only {format_count(decoded_count, 'frame')}{can_be_decoded}",
             fix=f"{copy_or}film for at least ten seconds",
         )
-    if not changes_size and (video.damaged_count or time < _MIN_DURATION_RATIO * video.seconds):
+    if video.damaged_count or (not changes_size and time < _MIN_DURATION_RATIO * video.seconds):
         notes.append(
             f"the video is damaged or cut off: {decoded_count} frames of {time:.1f} s could be read, of "
             f"{video.seconds:.1f} s that it should have; copy it again if there is more"

@@ -261,7 +261,7 @@ def estimate_exposure_spread(scene: Scene, cache: PictureCache) -> float | None:
 def describe_exposure_spread(spread: float | None) -> str:
     """Describe in words what `estimate_exposure_spread` returned."""
     if spread is None:
-        return "no tracks show the photos' exposures"
+        return "too few tracks show the photos' exposures"
     return f"by their tracks the photos differ by {spread:.2f} stops"
 
 

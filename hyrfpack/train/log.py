@@ -151,7 +151,10 @@ class TrainingLog:
         try:
             yield
         except Exception as error:  # TensorBoard raises errors of many types, as on a full disk or a broken package.
-            self.scalars = None
+            broken, self.scalars = self.scalars, None
+            with suppress(Exception):  # it may be closing that failed
+                if broken is not None:
+                    broken.close()
             reason = printable(str(error) or type(error).__name__)
             _LOG.warning(
                 f"{_scalars_folder(self.path)}: TensorBoard's files cannot be written ({reason}); training continues "

@@ -91,8 +91,8 @@ def test_a_value_outside_the_limits_is_an_error_that_names_the_setting(wrong):
         BlurConfig(**wrong)
 
 
-def test_a_text_that_is_none_is_an_error_that_names_the_setting():
-    with pytest.raises(ValueError, match="^title is 3; it must be a text$"):
+def test_a_string_of_another_type_is_an_error_that_names_the_setting():
+    with pytest.raises(ValueError, match="^title is 3; it must be a string$"):
         ExportConfig(title=3)
 
 

@@ -210,7 +210,7 @@ def test_gains_are_not_learnt_by_default_even_where_photos_differ_by_a_stop():
 
 def test_gains_of_photos_without_tracks_start_at_one():
     trainer = Trainer(dataclasses.replace(exposed_scene(alternating_gains(6)), tracks={}), SHORT_CONFIG)
-    assert trainer.choices["exposure"] == "per-image gains; no tracks show the photos' exposures"
+    assert trainer.choices["exposure"] == "per-image gains; too few tracks show the photos' exposures"
     assert torch.equal(trainer.exposures.values, torch.zeros(6, 3))
 
 
@@ -218,7 +218,7 @@ def test_tracks_too_short_to_compare_photos_are_not_reported_as_equal_exposures(
     scene = exposed_scene(alternating_gains(6))
     few = {name: rows[: MIN_POINTS_PER_PHOTO - 1] for name, rows in scene.tracks.items()}
     trainer = Trainer(dataclasses.replace(scene, tracks=few), SHORT_CONFIG)
-    assert trainer.choices["exposure"] == "per-image gains; no tracks show the photos' exposures"
+    assert trainer.choices["exposure"] == "per-image gains; too few tracks show the photos' exposures"
 
 
 def test_an_interrupted_run_continues_to_the_same_bytes(tmp_path):

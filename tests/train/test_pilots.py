@@ -383,7 +383,7 @@ def test_photos_of_one_exposure_need_no_pilots(monkeypatch):
 def test_photos_without_tracks_need_no_pilots_and_are_not_said_to_have_one_exposure():
     runs = ScenePilots(make_scene(20), LONG_CONFIG, PictureCache(), CPU_DEVICE)
     decision, reason = measure_exposure(runs)
-    assert (decision, runs.scores) == (False, []) and reason == "no tracks show the photos' exposures"
+    assert (decision, runs.scores) == (False, []) and reason == "too few tracks show the photos' exposures"
 
 
 @pytest.mark.parametrize(("photos", "rounds"), [(8, 3), (11, 3), (12, 2), (100, 2)])
