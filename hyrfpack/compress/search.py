@@ -124,8 +124,8 @@ def find_fullest(
         place = min(max(place, low), high)
     if best is not None:
         return best
-    is_largest = too_large is not None and too_large[0] >= bounds[1]
-    return largest, trial if is_largest and trial is not None else make_trial(largest)
+    has_largest = too_large is not None and too_large[0] >= bounds[1]
+    return largest, trial if has_largest and trial is not None else make_trial(largest)
 
 
 def _interpolate(measured: list[tuple[float, float]], wanted: float) -> float:

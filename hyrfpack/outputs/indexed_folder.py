@@ -35,19 +35,19 @@ class IndexedFolder:
         Raises:
             HyrfError: the file cannot be written, or it exists and may not be replaced.
         """
-        with self._counted(name) as path:
+        with self._recorded(name) as path:
             write_atomic(path, data, overwrite=self.overwrite, rename=False)
 
     def copy(self, name: str, source: str | os.PathLike[str]) -> None:
         """Copy a file; name and errors are those of `write`."""
         with (
-            self._counted(name) as path,
+            self._recorded(name) as path,
             pending_file(path, os.path.getsize(source), overwrite=self.overwrite, rename=False) as pending,
         ):
             shutil.copyfile(source, pending.temporary)
 
     @contextmanager
-    def _counted(self, name: str) -> Iterator[Path]:
+    def _recorded(self, name: str) -> Iterator[Path]:
         """Yield the path of a file that the block writes, and count the file."""
         path = self.path / name
         is_new = not path.exists()

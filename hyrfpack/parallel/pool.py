@@ -104,7 +104,8 @@ def run_tasks(task: Callable[[int], None], count: int, *, sequential: bool = Fal
 
     Threads take tasks one by one, so that tasks of different length are balanced. The result must not depend on which
     thread runs which task, so each task must write to its own memory. Tasks that are started inside a task run one
-    after the other in the same thread. After the first error or an interrupt no further task is started.
+    after the other in the same thread. After the first error or an interrupt no further task is started;
+    after an interrupt, those that have begun may still run when this raises.
 
     Args:
         task: function of the task's index.
