@@ -104,8 +104,8 @@ def run_tasks(task: Callable[[int], None], count: int, *, sequential: bool = Fal
 
     Threads take tasks one by one, so that tasks of different length are balanced. The result must not depend on which
     thread runs which task, so each task must write to its own memory. Tasks that are started inside a task run one
-    after the other in the same thread. After the first error or an interrupt no further task is started;
-    after an interrupt, those that have begun may still run when this raises.
+    after the other in the same thread. After the first error or an interrupt no further task is started.
+    After an interrupt, tasks that have begun may still run when this raises.
 
     Args:
         task: function of the task's index.
@@ -124,6 +124,11 @@ def run_tasks(task: Callable[[int], None], count: int, *, sequential: bool = Fal
     pending = iter(range(count))
     errors: dict[int, BaseException] = {}
 
+    def take_remaining_tasks() -> None:
+        """Keep all threads from starting further tasks."""
+        for _ in pending:
+            pass
+
     def worker() -> None:
         # next() on a range iterator is atomic under the GIL.
         for index in pending:
@@ -131,15 +136,13 @@ def run_tasks(task: Callable[[int], None], count: int, *, sequential: bool = Fal
                 task(index)
             except BaseException as error:
                 errors[index] = error
-                for _ in pending:  # Taking all remaining tasks keeps the other threads from starting them.
-                    pass
+                take_remaining_tasks()
 
     try:
         for future in [_executor(threads).submit(worker) for _ in range(min(threads, count))]:
             future.result()
     except BaseException:  # such as Ctrl-C, which only the main thread notices
-        for _ in pending:
-            pass
+        take_remaining_tasks()
         raise
     if errors:
         raise errors[min(errors)]

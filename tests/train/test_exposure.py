@@ -214,7 +214,7 @@ def test_gains_of_photos_without_tracks_start_at_one():
     assert torch.equal(trainer.exposures.values, torch.zeros(6, 3))
 
 
-def test_tracks_too_short_to_compare_photos_are_not_reported_as_equal_exposures():
+def test_too_few_points_to_compare_photos_are_not_reported_as_equal_exposures():
     scene = exposed_scene(alternating_gains(6))
     few = {name: rows[: MIN_POINTS_PER_PHOTO - 1] for name, rows in scene.tracks.items()}
     trainer = Trainer(dataclasses.replace(scene, tracks=few), SHORT_CONFIG)
