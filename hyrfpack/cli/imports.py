@@ -11,7 +11,6 @@ from hyrfpack.cli.common import (
     choose_command_device,
     device_option,
     format_table,
-    is_given,
     json_option,
     note,
     note_rename,
@@ -69,18 +68,13 @@ def import_(
     from hyrfpack.imports import import_splats
     from hyrfpack.imports.run import check_target
 
-    context = click.get_current_context()
-    has_psnr = any(is_given(context, option) for option in context.command.params if option.name == "psnr")
-    if has_psnr and settings["target_bytes"] is not None:
-        raise click.UsageError("--psnr and --target-size each decide how large the file is; give one of them")
+    config = ImportConfig(**settings)
     check_target(source, output, cameras, overwrite=overwrite)  # before the cameras are read
     cameras = cameras or _find_training_cameras(source)
     given = None if cameras is None else _read_cameras(cameras)
     torch_device = choose_command_device(device)
-    config = ImportConfig(**settings)
-    report = import_splats(
-        source, output, config, cameras=given, overwrite=overwrite, context=RunContext(device=torch_device)
-    )
+    context = RunContext(device=torch_device)
+    report = import_splats(source, output, config, cameras=given, overwrite=overwrite, context=context)
     written = note_rename(output, report.file)
     if as_json:
         print_json(report.to_dict())

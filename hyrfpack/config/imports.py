@@ -8,6 +8,8 @@ from typing import Annotated
 from hyrfpack.config.settings import Range, Seed, check_settings
 from hyrfpack.errors import HyrfError
 
+DEFAULT_IMPORT_PSNR_DB = 37.0
+
 
 @dataclass(frozen=True)
 class ImportConfig:
@@ -17,7 +19,8 @@ class ImportConfig:
     file.
 
     Attributes:
-        psnr: PSNR of renders of FILE against renders of SOURCE; more dB take more bytes.
+        psnr: PSNR of renders of FILE against renders of SOURCE; more dB take more bytes. Default: 37
+            without a target size.
         worst: PSNR that the worst view must reach, too.
         target_bytes: best quality within this file size, such as 2MB, instead of a PSNR.
         size: longer side of the reference renders.
@@ -25,7 +28,7 @@ class ImportConfig:
         seed: random seed. On a CPU, the same seed gives the same file.
     """
 
-    psnr: Annotated[float, Range(10, 60, unit="dB")] = 37.0
+    psnr: Annotated[float | None, Range(10, 60, unit="dB")] = None
     worst: Annotated[float | None, Range(10, 60, unit="dB")] = None
     target_bytes: Annotated[int | None, Range(1, unit="bytes")] = None
     size: Annotated[int, Range(16, 4096, unit="pixels")] = 400
@@ -40,8 +43,13 @@ class ImportConfig:
                 "a target size and a PSNR of the worst view each decide how large the file is",
                 fix="give one of `target_bytes` and `worst`",
             )
-        if self.psnr != ImportConfig.psnr and self.target_bytes is not None:
+        if self.psnr is not None and self.target_bytes is not None:
             raise HyrfError(
                 "a target size and a PSNR each decide how large the file is",
                 fix="give one of `target_bytes` and `psnr`",
             )
+
+    @property
+    def target_psnr(self) -> float:
+        """The PSNR to reach in dB; with a target size, the one that the search for that size starts from."""
+        return DEFAULT_IMPORT_PSNR_DB if self.psnr is None else self.psnr

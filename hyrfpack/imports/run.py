@@ -177,9 +177,10 @@ def import_loaded_splats(
         provenance: dict = {"steps": 0, "seed": config.seed, "choices": choices}
         if config.target_bytes is None:  # With a target size, nobody knows the PSNR of the file before it is encoded.
             # By default, `compress` adds a share of this error. That of the model itself would be next to none.
-            provenance["psnr"] = min(unpacked_psnr, config.psnr)
+            provenance["psnr"] = min(unpacked_psnr, config.target_psnr)
         packing = part_of_progress(progress, 0.7, 0.97)
-        data = pack(prepared, config.psnr, provenance, packing, worst=config.worst, target_bytes=config.target_bytes)
+        psnr, target_bytes = config.target_psnr, config.target_bytes
+        data = pack(prepared, psnr, provenance, packing, worst=config.worst, target_bytes=target_bytes)
         progress(TaskEvent("scoring the file", 0.97))
         # The file is written after all else that an interrupt may end, so that an earlier file is kept.
         written = write_atomic(target, data, overwrite=overwrite)
@@ -187,7 +188,7 @@ def import_loaded_splats(
         decoded.precision = prepared.model.precision
         scores = prepared.test.psnr_per_view(decoded)
     reached_psnr = float(np.mean(scores))
-    if config.target_bytes is None and _falls_short(reached_psnr, config.psnr):
+    if config.target_bytes is None and _falls_short(reached_psnr, config.target_psnr):
         _LOG.warning(_shortfall(reached_psnr, unpacked_psnr, config, has_cameras=cameras is not None))
     if config.worst is not None and _falls_short(min(scores), config.worst):
         _LOG.warning(
@@ -202,7 +203,7 @@ def import_loaded_splats(
         psnr=reached_psnr,
         psnr_worst=min(scores),
         psnr_unpacked=unpacked_psnr,
-        psnr_asked=config.psnr if config.target_bytes is None else None,
+        psnr_asked=config.target_psnr if config.target_bytes is None else None,
         bytes_source=None,
         bytes_ply=4 * len(splats) * (17 + 3 * (splats.harmonics.shape[1] - 1)),
         bytes_after=len(data),
@@ -222,10 +223,10 @@ def _shortfall(reached_psnr: float, unpacked_psnr: float, config: ImportConfig, 
     `has_cameras`: whether the user gave the viewpoints.
     """
     outcome = (
-        f"the target PSNR is {config.psnr:g} dB, but the file reaches {reached_psnr:.1f} dB at held-out viewpoints "
-        f"({unpacked_psnr:.1f} dB before compression)"
+        f"the target PSNR is {config.target_psnr:g} dB, but the file reaches {reached_psnr:.1f} dB at held-out "
+        f"viewpoints ({unpacked_psnr:.1f} dB before compression)"
     )
-    if not _falls_short(unpacked_psnr, config.psnr):
+    if not _falls_short(unpacked_psnr, config.target_psnr):
         return f"{outcome}; set a higher target with `psnr`"
     if has_cameras:
         return (

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from hyrfpack.compress.sensitivity import MAX_SENSITIVITY_VIEWS, TARGET_DRAWN_GAUSSIANS
-from hyrfpack.config.imports import ImportConfig
+from hyrfpack.config.imports import DEFAULT_IMPORT_PSNR_DB
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.train import FULL_STEPS, DensityConfig, TrainConfig
 from hyrfpack.data.pictures import fit_size
@@ -80,7 +80,7 @@ QUALITIES = {
         gpu_steps=TrainConfig.steps,
         max_size=DEFAULT_MAX_SIZE,
         finetune_steps=0,
-        import_psnr=ImportConfig.psnr,
+        import_psnr=DEFAULT_IMPORT_PSNR_DB,
     ),
     "best": Quality(
         steps=10_000,
