@@ -69,6 +69,8 @@ def scene_provenance(scene: Scene) -> dict:
 def quantized_provenance(provenance: dict, scale: float, points: np.ndarray | None = None) -> dict:
     """Shorten a provenance for small files: round its numbers and replace "cameras" by fewer "coarse_cameras".
 
+    `psnr` stays as it is, and `psnr_before` says that compression has changed the model since it was measured.
+
     MIN_COARSE_CAMERAS are kept, and more where these show the scene less finely than all of them. Their positions are
     rounded to about scale / COARSE_POSE_STEPS_PER_SCENE_SCALE, which is precise enough to render from there, but not to
     train. Entries that cannot be read are left out.
@@ -80,6 +82,8 @@ def quantized_provenance(provenance: dict, scale: float, points: np.ndarray | No
     """
     replaced = ("cameras", RATE_RATIO_KEY) if "cameras" in provenance else ()
     kept = {name: value for name, value in provenance.items() if name not in replaced}
+    if "psnr" in kept:
+        kept.setdefault("psnr_before", "compression")
     with suppress(TypeError, ValueError, ArithmeticError, KeyError):
         kept["viewpoint"] = Viewpoint.from_json(provenance["viewpoint"]).to_json(rounded=True)
     with suppress(TypeError, ValueError, ArithmeticError, KeyError):

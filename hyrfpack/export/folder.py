@@ -170,7 +170,7 @@ def export_gallery(
         folder: output folder; created if it is missing. Files with other names stay.
         data: photos of each scene, or None. Held-out photos score a model, and the list shows the score. Without them
             the list shows how well the model fits its training photos or the splats that it was imported from, if the
-            file states it.
+            file states it. It says so if this was measured before compression.
         overwrite: replace existing files; if False, an existing file is an error.
         title: title of the list. Default: the name of the folder.
         credit: text below the title of each scene.
@@ -326,12 +326,17 @@ def _describe_quality(path: StrPath, model: HybridModel | MergedModel, data: Sce
         return f"{scores.psnr:.2f} dB on {format_count(len(scores.views), 'held-out photo')}"
     if isinstance(model, MergedModel):
         return ""
-    provenance = describe_file(path)["provenance"]
+    facts = describe_file(path)
+    provenance = facts["provenance"]
     stated, choices = provenance.get("psnr"), provenance.get("choices")
-    if not isinstance(stated, float) or not 0 < stated < IDENTICAL_PSNR:
+    if type(stated) not in (int, float) or not 0 < stated < IDENTICAL_PSNR:
         return ""
     imported = isinstance(choices, dict) and "imported" in choices
-    return f"{stated:.1f} dB " + ("against the splats it was made of" if imported else "on its training photos")
+    quality = f"{stated:.1f} dB " + ("against the splats it was made of" if imported else "on its training photos")
+    # Earlier versions did not store that a model was scored before compression. Training writes profile "raw".
+    is_trained_and_compressed = not imported and facts["profile"] != "raw"
+    scored_before = provenance.get("psnr_before") == "compression" or is_trained_and_compressed
+    return f"{quality} before compression" if scored_before else quality
 
 
 def _choose_file_names(sources: Sequence[StrPath], *, is_gallery: bool) -> list[tuple[str, str]]:

@@ -12,15 +12,20 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrfpack import format as hyrf_format
 from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
 from hyrfpack.config.imports import ImportConfig
 from hyrfpack.context import RunContext
 from hyrfpack.counts import format_count
+from hyrfpack.format.codec import decode_model
+from hyrfpack.format.container import read_container
+from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.min_file_size import check_target_bytes
+from hyrfpack.format.rewrite import with_metadata
+from hyrfpack.format.sections import SECTION_CONTENTS
 from hyrfpack.imports.pack import pack
 from hyrfpack.imports.prepare import prepare_model
+from hyrfpack.model import ModelConfig
 from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.outputs import Outputs, StrPath
 from hyrfpack.progress import TaskEvent, part_of_progress
@@ -175,19 +180,18 @@ def import_loaded_splats(
         )
         choices = {"imported": imported}
         provenance: dict = {"steps": 0, "seed": config.seed, "choices": choices}
-        if config.target_bytes is None:  # With a target size, nobody knows the PSNR of the file before it is encoded.
-            # By default, `compress` adds a share of this error. That of the model itself would be next to none.
-            provenance["psnr"] = min(unpacked_psnr, config.target_psnr)
         packing = part_of_progress(progress, 0.7, 0.97)
         psnr, target_bytes = config.target_psnr, config.target_bytes
         data = pack(prepared, psnr, provenance, packing, worst=config.worst, target_bytes=target_bytes)
         progress(TaskEvent("scoring the file", 0.97))
-        # The file is written after all else that an interrupt may end, so that an earlier file is kept.
-        written = write_atomic(target, data, overwrite=overwrite)
-        decoded = hyrf_format.load_model(written).to(device)
+        decoded = decode_model(data, device)
         decoded.precision = prepared.model.precision
         scores = prepared.test.psnr_per_view(decoded)
-    reached_psnr = float(np.mean(scores))
+        reached_psnr = float(np.mean(scores))
+        if config.target_bytes is None:  # With a target size, there may be no space for it.
+            data = _state_psnr(data, decoded.config, reached_psnr)
+        # The file is written after all else that an interrupt may end, so that an earlier file is kept.
+        written = write_atomic(target, data, overwrite=overwrite)
     if config.target_bytes is None and _falls_short(reached_psnr, config.target_psnr):
         _LOG.warning(_shortfall(reached_psnr, unpacked_psnr, config, has_cameras=cameras is not None))
     if config.worst is not None and _falls_short(min(scores), config.worst):
@@ -210,6 +214,13 @@ def import_loaded_splats(
         seconds=time.perf_counter() - started,
         file=str(written),
     )
+
+
+def _state_psnr(data: bytes, config: ModelConfig, psnr: float) -> bytes:
+    """Return a file with its PSNR in the provenance. By default, `compress` adds a share of that error."""
+    container = read_container(data, SECTION_CONTENTS)
+    provenance = read_metadata(container).provenance
+    return with_metadata(container, config, {**provenance, "psnr": round(psnr, 2)})
 
 
 def _falls_short(reached_psnr: float, asked: float) -> bool:

@@ -21,6 +21,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.export import ExportReport, export_gallery, export_model, export_player
 from hyrfpack.format import load_model, save_model
+from hyrfpack.format.codec import repack
 
 GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 GOLDEN_SCENE = Path(__file__).parents[1] / "golden" / "scene"
@@ -198,6 +199,22 @@ def test_a_gallery_lists_its_scenes_and_links_to_its_player(model_file, splats_f
     assert "40 Gaussians" in page and "24.3 dB on its training photos" in page
     size = sum(path.stat().st_size for path in (tmp_path / "g").iterdir())
     assert report == ExportReport(str(tmp_path / "g"), size, 80, native=True)
+
+
+@pytest.mark.parametrize("psnr, shown", [(24, "24.0 dB on"), (24.5, "24.5 dB on"), (True, None), ("24", None)])
+def test_a_gallery_shows_a_stated_psnr_that_is_a_number(psnr, shown, tmp_path):
+    save_model(load_model(write_model(tmp_path / "m.hyrf")), tmp_path / "stated.hyrf", provenance={"psnr": psnr})
+    export_gallery([tmp_path / "stated.hyrf"], tmp_path / "g")
+    page = (tmp_path / "g" / "index.html").read_text()
+    assert shown in page if shown else " dB" not in page
+
+
+def test_a_gallery_says_that_a_compressed_model_was_scored_before(model_file, tmp_path):
+    save_model(load_model(model_file), tmp_path / "old.hyrf", "paper", provenance={"psnr": 24.3})
+    repack(model_file, tmp_path / "small.hyrf", "paper")
+    repack(tmp_path / "small.hyrf", tmp_path / "raw.hyrf", "raw")
+    export_gallery([tmp_path / name for name in ("old.hyrf", "small.hyrf", "raw.hyrf")], tmp_path / "g")
+    assert (tmp_path / "g" / "index.html").read_text().count("24.3 dB on its training photos before compression<") == 3
 
 
 def test_a_gallery_shows_the_psnr_on_held_out_photos(model_file, tmp_path):

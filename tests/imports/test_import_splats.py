@@ -46,13 +46,28 @@ def test_same_splats_and_seed_give_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_a_gallery_shows_the_psnr_of_an_import_only_if_the_import_aimed_at_one(tmp_path: Path) -> None:
-    for name, change in (("psnr", {"psnr": 20.0}), ("size", {"target_bytes": 20_000})):
+    reports = {}
+    for name, change in (("psnr", {"psnr": 20}), ("size", {"target_bytes": 20_000})):
         target = tmp_path / f"{name}.hyrf"
-        import_loaded_splats(ball_splats(40), target, replace(TINY_IMPORT_CONFIG, **change))
+        reports[name] = import_loaded_splats(ball_splats(40), target, replace(TINY_IMPORT_CONFIG, **change))
+        assert reports[name].bytes_after == target.stat().st_size
         assert ("psnr" in hyrfpack.describe_file(target)["provenance"]) == (name == "psnr")
         hyrfpack.export_gallery([target], tmp_path / name)
     texts = {name: (tmp_path / name / "index.html").read_text("utf-8") for name in ("psnr", "size")}
-    assert "20.0 dB against the splats it was made of" in texts["psnr"] and " dB" not in texts["size"]
+    psnr = hyrfpack.describe_file(tmp_path / "psnr.hyrf")["provenance"]["psnr"]
+    assert psnr == round(reports["psnr"].psnr, 2)
+    assert f"{psnr:.1f} dB against the splats it was made of<" in texts["psnr"] and " dB" not in texts["size"]
+
+
+def test_a_gallery_says_that_a_psnr_was_measured_before_compression(tmp_path: Path) -> None:
+    imported, raw, small = (tmp_path / f"{name}.hyrf" for name in ("imported", "raw", "small"))
+    import_loaded_splats(ball_splats(40), imported, replace(TINY_IMPORT_CONFIG, psnr=20.0))
+    hyrfpack.compress_model(imported, small, hyrfpack.CompressConfig(profile="paper"))
+    hyrfpack.compress_model(small, raw, hyrfpack.CompressConfig(profile="raw"))
+    hyrfpack.export_gallery([imported, small, raw], tmp_path / "gallery")
+    text = (tmp_path / "gallery" / "index.html").read_text("utf-8")
+    assert text.count("against the splats it was made of") == 3
+    assert text.count("made of before compression<") == 2
 
 
 def test_the_largest_seed_is_accepted(tmp_path: Path) -> None:
