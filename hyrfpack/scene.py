@@ -18,6 +18,8 @@ Item = TypeVar("Item")
 RIGID_TOLERANCE = 1e-3
 # Photos whose longer side has more pixels are shrunk to this length, as in 3DGS.
 DEFAULT_MAX_SIZE = 1600
+# Poses and sizes are float32 in files and pictures. Its range is wider, as cameras may stand far outside of a scene.
+MAX_WORLD_COORDINATE = 1e30
 
 
 def rigid_pose(values: object) -> np.ndarray:

@@ -17,13 +17,12 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.model import HybridModel
 from hyrfpack.model.frame import Frame
 from hyrfpack.rotations import IDENTITY, quaternion_from_matrix, rotation_matrix
-from hyrfpack.scene import Camera, View
+from hyrfpack.scene import MAX_WORLD_COORDINATE, Camera, View
 
 CAMERA_KEYS = ("cameras", "coarse_cameras")
 # A scene whose frame is turned by less has been turned back, and gets the file of one that was never turned.
 MIN_TURN_RADIANS = 1e-12
-# Poses and sizes are float32 in files and pictures. Its range is wider, as cameras may stand far outside of the frame.
-MIN_FRAME_SCALE, MAX_WORLD_COORDINATE = 1e-30, 1e30
+MIN_FRAME_SCALE = 1e-30  # sizes are float32 in files and pictures, see MAX_WORLD_COORDINATE
 
 
 @dataclass(frozen=True, eq=False)

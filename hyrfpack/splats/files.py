@@ -9,7 +9,7 @@ import numpy as np
 
 from hyrfpack.choices import DEFAULT_SPZ_VERSION
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.scene import Camera
+from hyrfpack.scene import MAX_WORLD_COORDINATE, Camera
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats
@@ -46,7 +46,19 @@ def read_splats(path: str | os.PathLike[str]) -> Splats:
     Raises:
         HyrfDataError: the file does not exist, has none of these formats, or is damaged.
     """
-    path = Path(path)
+    splats = _read_any_splats(Path(path))
+    for part, values in (("position", splats.positions), ("scale", splats.scales)):
+        if (is_large := (np.abs(values) > MAX_WORLD_COORDINATE).any(axis=1)).any():
+            raise HyrfDataError(
+                f"{path}: the {part} of Gaussian {int(is_large.argmax()):,} of {len(values):,} is beyond "
+                f"{MAX_WORLD_COORDINATE:g} units, because the file is damaged or its training failed",
+                fix="export it again, or remove such Gaussians",
+            )
+    return splats
+
+
+def _read_any_splats(path: Path) -> Splats:
+    """Read splats of any place and size; the errors are those of `read_splats`."""
     if path.name == sog.META_NAME:
         path = path.parent
     extension = path.suffix.lower()

@@ -54,6 +54,19 @@ def test_every_format_preserves_count_and_positions(extension, place):
     assert back.degree == (0 if extension == ".splat" else 3)
 
 
+@pytest.mark.parametrize("extension", [".ply", ".splat"])
+@pytest.mark.parametrize("part", ["position", "scale"])
+def test_numbers_too_large_for_a_scene_are_refused(part, extension, tmp_path):
+    splats = random_splats(3)
+    getattr(splats, f"{part}s")[1] *= 1e37
+    path = tmp_path / f"large{extension}"
+    path.write_bytes(encode_with_camera(splats, extension))
+    with pytest.raises(
+        HyrfDataError, match=rf"large{extension}: the {part} of Gaussian \d of 3 is beyond 1e\+30 units"
+    ):
+        read_splats(path)
+
+
 @pytest.mark.parametrize("extension", READABLE_ENDINGS)
 def test_files_are_read_by_suffix_in_any_case(extension, tmp_path):
     path = tmp_path / f"SCENE{extension.upper()}"
