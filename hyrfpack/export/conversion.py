@@ -39,6 +39,8 @@ _LOG = logging.getLogger(__name__)
 
 MEASURED_VIEWS = 12
 MEASURED_SIZE_PIXELS = 400
+# Smaller Gaussians are points in pictures of the whole scene, so that it does not show if their scales are clamped.
+MIN_VISIBLE_SCALE_RADII = 1e-3
 
 
 @dataclass(frozen=True)
@@ -131,8 +133,8 @@ def _convert(
     whole = splats if config.crop is None else select_splats(splats, config.crop)
     kept = select_splats(whole, None, config.min_opacity)
     kept = kept.with_degree(min(kept.degree, kind.max_degree, kept.degree if config.degree is None else config.degree))
-    _check_limits(kind, splats, kept)
     weighted = WeightedSplats.from_splats(whole, str(source))
+    _check_limits(kind, splats, kept, weighted.radius)
     camera = Viewpoint.from_frame(weighted.frame.center, weighted.frame.scale).camera
     hints = Hints(camera=camera, spz_version=config.spz_version)
     progress(TaskEvent(f"writing {format_count(len(kept), 'Gaussian')} as {kind.ending}", 0.2))
@@ -191,8 +193,15 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
     return kind
 
 
-def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats) -> None:
-    """Raise HyrfError for positions that the format cannot hold, and log a warning for each other loss."""
+def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats, radius: float) -> None:
+    """Raise HyrfError for positions that the format cannot hold, and log a warning for each other loss.
+
+    Args:
+        kind: the format.
+        splats: the splats of the source.
+        kept: those that are written.
+        radius: half the size of the scene, world units.
+    """
     reach = float(np.abs(kept.positions).max())
     if reach > kind.max_coordinate:
         raise HyrfError(
@@ -205,11 +214,25 @@ def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats) -> None:
             f"{kind.ending} stores harmonics up to degree {kind.max_degree}; higher ones, up to degree "
             f"{splats.degree}, are lost"
         )
+    largest, smallest = kept.scales.max(axis=1), kept.scales.min(axis=1)
+    _warn_of_clamped_scales(kind, largest > kind.max_scale, "larger", kind.max_scale)
+    if kind.min_scale > MIN_VISIBLE_SCALE_RADII * radius:
+        _warn_of_clamped_scales(kind, smallest < kind.min_scale, "smaller", kind.min_scale)
     if splats.antialiased and not kind.stores_antialiased:
         able = " or ".join(row.ending for row in FORMATS.values() if row.stores_antialiased)
         _LOG.warning(
             f"{kind.ending} cannot store that the splats are antialiased: set it in the program that draws the file, "
             f"or choose {able}"
+        )
+
+
+def _warn_of_clamped_scales(kind: SplatFormat, is_clamped: np.ndarray, than: str, limit: float) -> None:
+    """Log a warning if the scales of some Gaussians are clamped to a limit of the format; `is_clamped` is (N,) bool."""
+    if is_clamped.any():
+        _LOG.warning(
+            f"scales of {is_clamped.sum():,} of {len(is_clamped):,} Gaussians are {than} than {limit:.3g} units, the "
+            f"limit of {kind.ending}, and are clamped to it: choose another format, or change the scene's unit "
+            f"({suggest_command('import')}, {suggest_command('edit')} with `scale`, {suggest_command('export')})"
         )
 
 

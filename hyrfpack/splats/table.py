@@ -23,7 +23,7 @@ class FileKind:
         module: a module of another package that only this kind needs, or None.
         max_coordinate: largest absolute coordinate of a position, world units. Infinite means the range of float32 or
             more.
-        max_scale: largest scale, world units.
+        min_scale, max_scale: smallest and largest scale, world units. Others are clamped.
         stores_antialiased: whether the file can mark splats as antialiased.
     """
 
@@ -31,6 +31,7 @@ class FileKind:
     max_degree: int = MAX_DEGREE
     module: str | None = None
     max_coordinate: float = math.inf
+    min_scale: float = 0.0
     max_scale: float = math.inf
     stores_antialiased: bool = False
 
@@ -71,6 +72,7 @@ _FORMAT_ROWS = (
         decode=spz.decode,
         is_readable=True,
         max_coordinate=spz.MAX_COORDINATE,
+        min_scale=spz.MIN_SCALE,
         max_scale=spz.MAX_SCALE,
         stores_antialiased=True,
     ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import product
 from pathlib import Path
 
@@ -101,6 +102,31 @@ def test_a_crop_has_no_loss_but_min_opacity_has(tmp_path):
 def test_lost_harmonics_are_reported(tmp_path, caplog):
     hyrfpack.convert_splats(write_splats(tmp_path, ".ply", ball_splats(GAUSSIAN_COUNT, degree=3)), tmp_path / "a.splat")
     assert caplog.messages == [".splat stores harmonics up to degree 0; higher ones, up to degree 3, are lost"]
+
+
+@pytest.mark.parametrize(
+    ("unit", "large", "expected"),
+    [
+        pytest.param(1, None, None, id="meters"),
+        pytest.param(1, 1e-7, None, id="flat"),  # so thin that its thickness does not show
+        pytest.param(
+            1, 1500, r"scales of 6 of 60 Gaussians are larger than 379 units, the limit of \.spz,", id="large"
+        ),
+        pytest.param(1e-4, None, r"scales of 60 of 60 Gaussians are smaller than 4\.54e-05 units,", id="small"),
+    ],
+)
+def test_scales_that_spz_clamps_are_reported(unit, large, expected, tmp_path, caplog):
+    splats = ball_splats(GAUSSIAN_COUNT)
+    splats.positions[:], splats.scales[:] = splats.positions * unit, splats.scales * np.float32(unit)
+    if large:
+        splats.scales[::10, 0] = large
+    hyrfpack.convert_splats(write_splats(tmp_path, ".ply", splats), tmp_path / "a.spz")
+    messages = [message for message in caplog.messages if "scales of" in message]
+    assert len(messages) == (expected is not None)
+    if expected:
+        assert re.search(expected + r".*choose another format, or .*`scale`", messages[0])
+    assert hyrfpack.convert_splats(tmp_path / "before.ply", tmp_path / "a.sog").psnr > 20
+    assert len([message for message in caplog.messages if "scales of" in message]) == len(messages)
 
 
 def test_progress_is_reported_in_order(tmp_path):

@@ -72,7 +72,7 @@ _BYTE_VALUES = np.arange(256, dtype=np.float64)
 _OPACITY_BY_BYTE = np.float32(_BYTE_VALUES / 255)
 _COLOR_BY_BYTE = np.float32((_BYTE_VALUES / 255 - 0.5) / 0.15)
 _SCALE_BY_BYTE = np.float32(np.exp(_BYTE_VALUES / 16 - 10))
-MAX_SCALE = float(_SCALE_BY_BYTE[-1])  # world units
+MIN_SCALE, MAX_SCALE = float(_SCALE_BY_BYTE[0]), float(_SCALE_BY_BYTE[-1])  # world units
 _HARMONIC_BY_BYTE = np.float32((_BYTE_VALUES - 128) / 128)
 _QUAT_COMPONENT_BY_BYTE = np.float32(_BYTE_VALUES / 127.5 - 1)
 
