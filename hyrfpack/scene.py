@@ -186,7 +186,7 @@ class View:
         camera: the camera after undistortion; its size is the size of the loaded picture.
         load: returns the Picture, whose size has been checked against the camera.
         is_resampled: whether the camera does not fit the stored photo even after scaling, because the picture is
-            undistorted, or cut from a panorama.
+            undistorted, turned upright, or cut from a panorama.
     """
 
     name: str

@@ -318,7 +318,7 @@ def _make_view(photo: Photo, max_size: int) -> View:
     if photo.face is not None:
         return View(photo.name, camera, FaceFile(photo.path, whole, photo.face, size[0], photo.mask), is_resampled=True)
     load = PhotoFile(photo.path, header.size, lens, photo.mask, photo.orientation)
-    return View(photo.name, camera, load, is_resampled=lens.is_distorted)
+    return View(photo.name, camera, load, is_resampled=lens.is_distorted or photo.orientation != 1)
 
 
 def _is_plausible(lens: Lens) -> bool:

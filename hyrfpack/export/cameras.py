@@ -7,18 +7,49 @@ import os
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from hyrfpack.atomic import pending_file
 from hyrfpack.colmap_library import load_pycolmap
-from hyrfpack.scene import Camera, evenly_spaced
+from hyrfpack.data.archive import display_path
+from hyrfpack.data.pictures import PhotoFile
+from hyrfpack.scene import Camera, View, evenly_spaced
 from hyrfpack.splats.splats import Splats
 
 COLMAP_FILES = tuple(f"sparse/0/{table}.bin" for table in ("cameras", "frames", "images", "points3D", "rigs"))
 MAX_COLMAP_POINTS = 100_000  # the size of a large reconstruction
 _MIN_POINT_OPACITY = 0.1  # because the centres of fainter Gaussians need not lie on a surface
+
+
+def fit_to_file(view: View) -> Camera:
+    """Return the camera of a photo as it is stored, which may be larger than as it is loaded.
+
+    The camera of a view whose file is unknown stays as it is.
+    """
+    camera = view.camera
+    if not isinstance(view.load, PhotoFile) or view.load.stored == (camera.width, camera.height):
+        return camera
+    width, height = view.load.stored
+    x, y = width / camera.width, height / camera.height
+    return replace(
+        camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y
+    )
+
+
+def locate_photo(view: View, folder: str | os.PathLike[str]) -> str:
+    """Return the path of a photo relative to a folder; "images/NAME" if its file is unknown or inside an archive."""
+    if not isinstance(view.load, PhotoFile) or display_path(view.load.path) != view.load.path:
+        return f"images/{view.name}"
+    photo, start = Path(os.path.abspath(view.load.path)), Path(os.path.abspath(folder))
+    if photo.is_relative_to(start):
+        return photo.relative_to(start).as_posix()
+    try:  # ".." leads out of the folder that a link points to, so links are resolved
+        return Path(os.path.relpath(photo.parent.resolve() / photo.name, start.resolve())).as_posix()
+    except ValueError:  # on Windows, no relative path leads to another drive
+        return photo.as_posix()
 
 
 def write_colmap(
@@ -29,7 +60,7 @@ def write_colmap(
     *,
     overwrite: bool = True,
 ) -> None:
-    """Write a binary COLMAP model to `folder`/sparse/0. The photos belong in `folder`/images.
+    """Write a binary COLMAP model to `folder`/sparse/0. The photo folder belongs at `folder`/images.
 
     The model has one PINHOLE camera for each distinct size and intrinsics, and one image without observations for each
     photo, all numbered from 1 in order. The points, from which a trainer can start, are evenly picked centres of
@@ -60,9 +91,9 @@ def write_colmap(
         model.add_image_with_trivial_frame(pycolmap.Image(name=name, image_id=image_id, camera_id=numbers[lens]), pose)
     if points is not None:
         solid = np.flatnonzero(points.opacities >= _MIN_POINT_OPACITY)
-        select_splats = points[np.array(evenly_spaced(solid.tolist(), max_points), np.int64)]
-        colors = np.round(255 * select_splats.base_colors).astype(np.uint8)
-        for position, color in zip(select_splats.positions, colors, strict=True):
+        chosen = points[np.array(evenly_spaced(solid.tolist(), max_points), np.int64)]
+        colors = np.round(255 * chosen.base_colors).astype(np.uint8)
+        for position, color in zip(chosen.positions, colors, strict=True):
             model.add_point3D(position, pycolmap.Track(), color)
 
     target = Path(folder, "sparse", "0")
@@ -76,13 +107,13 @@ def write_colmap(
 
 
 def encode_transforms(cameras: Sequence[tuple[str, Camera]]) -> bytes:
-    """Encode cameras as a transforms.json, which belongs in the same folder as the photo folder "images".
+    """Encode cameras as a transforms.json.
 
     Matrices are world_from_camera for OpenGL cameras (x right, y up, z backward), in the input's axes and units.
     Intrinsics are written once if all frames share them, otherwise for each frame.
 
     Args:
-        cameras: names of the photos, relative to the photo folder, with their cameras.
+        cameras: paths of the photos, relative to the folder of the transforms.json, with their cameras.
     """
     lenses = [
         {"w": c.width, "h": c.height, **dict(zip(("fl_x", "fl_y", "cx", "cy"), c.intrinsics, strict=True))}
@@ -90,9 +121,9 @@ def encode_transforms(cameras: Sequence[tuple[str, Camera]]) -> bytes:
     ]
     shared = lenses[0] if lenses and all(lens == lenses[0] for lens in lenses) else {}
     frames = []
-    for (name, camera), lens in zip(cameras, lenses, strict=True):
+    for (path, camera), lens in zip(cameras, lenses, strict=True):
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = camera.rotation.T * (1, -1, -1), camera.position
-        frames.append({"file_path": f"images/{name}", **({} if shared else lens), "transform_matrix": matrix.tolist()})
+        frames.append({"file_path": path, **({} if shared else lens), "transform_matrix": matrix.tolist()})
     content = {"camera_model": "PINHOLE", **shared, "frames": frames}
     return (json.dumps(content, indent=1) + "\n").encode()

@@ -16,7 +16,7 @@ from hyrfpack.context import RunContext
 from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.baked_scene import BakedScene, ShownSplats, bake_scene
-from hyrfpack.export.cameras import encode_transforms, write_colmap
+from hyrfpack.export.cameras import encode_transforms, fit_to_file, locate_photo, write_colmap
 from hyrfpack.export.folder import export_player
 from hyrfpack.export.kinds import (
     COLLISION_FILES,
@@ -151,7 +151,9 @@ def _export_file(
         if kind in (TRANSFORMS_JSON, COLMAP_FOLDER):
             _check_cameras(loaded, source, data)
         if kind is TRANSFORMS_JSON:
-            return _write_cameras(loaded, target, overwrite)
+            return _write_cameras(loaded, target, data, overwrite)
+        if kind is COLMAP_FOLDER and data is not None:
+            loaded = replace(loaded, cameras=[(view.name, fit_to_file(view)) for view in data.train])
         with context.open_progress("export") as progress:
             if kind in MESH_FILES:
                 return write_mesh(loaded, target, kind, config, overwrite, progress)
@@ -213,25 +215,29 @@ def _check_cameras(loaded: Source, source: str | os.PathLike[str], data: Scene |
             fix="export the cameras from the file that training wrote, or give the photos with `data`",
         )
     if data is None:
+        name, camera = loaded.cameras[0]
         _LOG.warning(
-            f"{source} does not keep the names of its photos, so the cameras are named {loaded.cameras[0][0]} and so "
-            "on, and are those of undistorted photos; give the photos with `data`"
+            f"{source} does not keep the names of its photos, so the cameras are named {name} and so on, and are those "
+            f"of undistorted photos of the size that training used (such as {camera.width} x {camera.height}); give "
+            "the photos with `data`"
         )
         return
     resampled = [view.name for view in data.train if view.is_resampled]
     if resampled:
         raise HyrfError(
             f"{data.path}: {len(resampled):,} of {len(data.train):,} photos (such as {resampled[0]}) are undistorted "
-            "as they are loaded, or cut from panoramas, so the model's cameras do not fit the files",
+            "or turned upright as they are loaded, or cut from panoramas, so the model's cameras do not fit the files",
             fix="undistort the photos (COLMAP's image_undistorter) and give the new folder with `data`",
         )
 
 
-def _write_cameras(loaded: Source, target: str | os.PathLike[str], overwrite: bool) -> ExportReport:
-    """Write the cameras as a transforms.json."""
-    data = encode_transforms(loaded.cameras)
-    written = write_atomic(target, data, overwrite=overwrite)
-    return ExportReport(str(written), len(data), cameras=len(loaded.cameras))
+def _write_cameras(loaded: Source, target: str | os.PathLike[str], data: Scene | None, overwrite: bool) -> ExportReport:
+    """Write the cameras as a transforms.json, for the photo files if they are known."""
+    folder, views = Path(target).parent, [] if data is None else data.train
+    named = [(locate_photo(view, folder), fit_to_file(view)) for view in views]
+    encoded = encode_transforms(named or [(f"images/{name}", camera) for name, camera in loaded.cameras])
+    written = write_atomic(target, encoded, overwrite=overwrite)
+    return ExportReport(str(written), len(encoded), cameras=len(loaded.cameras))
 
 
 def _write_points(baked: BakedScene, target: Path, kind: FileKind, overwrite: bool) -> ExportReport:

@@ -63,6 +63,15 @@ def test_views_of_distorted_photos_are_marked_as_resampled(nerfstudio_folder, co
     assert {view.is_resampled for view in load_scene(nerfstudio_folder(**coefficients)).views} == {is_resampled}
 
 
+def test_photos_that_are_turned_upright_are_marked_as_resampled(nerfstudio_folder):
+    root, exif = nerfstudio_folder(), Image.Exif()
+    exif[0x0112] = 6
+    for path in (root / "images").iterdir():
+        with Image.open(path) as image:
+            image.convert("RGB").transpose(Image.Transpose.ROTATE_90).save(path, exif=exif)
+    assert all(view.is_resampled for view in load_scene(root).views)
+
+
 def test_the_field_of_view_replaces_a_missing_focal_length(nerfstudio_folder):
     root = nerfstudio_folder(fl_x=None, fl_y=None, cx=None, cy=None, w=None, h=None, camera_angle_x=1.0)
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from hyrfpack import atomic
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfError
-from hyrfpack.export.cameras import encode_transforms, write_colmap
+from hyrfpack.export.cameras import encode_transforms, fit_to_file, locate_photo, write_colmap
 from hyrfpack.scene import Camera
 from hyrfpack.splats.splats import Splats
 
@@ -111,7 +112,7 @@ def test_a_failed_write_keeps_the_old_colmap_model(tmp_path, monkeypatch):
 @pytest.mark.parametrize("kinds", [1, 3])
 def test_transforms_round_trip(tmp_path, kinds):
     named = random_named_cameras(kinds=kinds)
-    (tmp_path / "transforms.json").write_bytes(encode_transforms(named))
+    (tmp_path / "transforms.json").write_bytes(encode_transforms([(f"images/{name}", cam) for name, cam in named]))
     add_photos(tmp_path, named)
     assert load_scene(tmp_path).layout == "nerfstudio"
     assert_same_cameras(tmp_path, named)
@@ -128,3 +129,40 @@ def test_an_opengl_camera_looks_along_minus_z_with_y_up():
     camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0, np.eye(4))  # looks along +z of a world with y down
     (frame,) = json.loads(encode_transforms([("a.png", camera)]))["frames"]
     np.testing.assert_array_equal(frame["transform_matrix"], np.diag([1.0, -1, -1, 1]))
+
+
+def write_blender_set(folder: Path, side: int) -> None:
+    for split in ("train", "test"):
+        (folder / split).mkdir(parents=True)
+        Image.new("RGB", (side, side)).save(folder / split / "r_0.png")
+        frame = {"file_path": f"./{split}/r_0", "transform_matrix": np.eye(4).tolist()}
+        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": [frame]}))
+
+
+def test_cameras_fit_the_photo_files_even_if_these_are_loaded_smaller(tmp_path):
+    write_blender_set(tmp_path, 64)
+    (small,), (stored,) = (load_scene(tmp_path, max_size=size).train for size in (24, 0))
+    assert small.camera.width == 24 and fit_to_file(stored) == stored.camera
+    fitted = fit_to_file(small)
+    assert (fitted.width, fitted.height) == (64, 64)
+    np.testing.assert_allclose(fitted.intrinsics, stored.camera.intrinsics, rtol=1e-12)
+
+
+def test_paths_of_photos_lead_to_their_files_from_any_folder(tmp_path):
+    write_blender_set(tmp_path / "set", 8)
+    (view,) = load_scene(tmp_path / "set").train
+    assert locate_photo(view, tmp_path / "set") == "train/r_0.png"
+    assert locate_photo(view, tmp_path / "set" / "train") == "r_0.png"
+    (tmp_path / "out" / "deep").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(tmp_path / "out" / "deep")
+    for folder in (tmp_path / "out", tmp_path / "link", tmp_path / "missing"):
+        assert locate_photo(view, folder).startswith("..")
+        if folder.exists():
+            assert (folder / locate_photo(view, folder)).samefile(tmp_path / "set" / "train" / "r_0.png")
+
+
+def test_photos_in_an_archive_are_named_as_in_a_folder_of_images(tmp_path):
+    write_blender_set(tmp_path / "set", 8)
+    archive = shutil.make_archive(str(tmp_path / "set"), "zip", tmp_path / "set")
+    (view,) = load_scene(archive).train
+    assert locate_photo(view, tmp_path) == "images/train/r_0.png"

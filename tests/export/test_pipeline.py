@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from scenes import ball_scene, ring, small_model, view_of
 
 import hyrfpack
@@ -159,6 +160,23 @@ def test_cameras_that_do_not_fit_the_photos_on_disk_are_refused(plain_file, tmp_
     with pytest.raises(HyrfError, match=f"1 of {len(scene.train)} photos .* do not fit the files"):
         export(plain_file, tmp_path / target, data=scene)
     assert not (tmp_path / target).exists()
+
+
+def test_exported_cameras_fit_the_photo_files(plain_file, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    export(plain_file, tmp_path / "transforms.json", data=ball_scene(views=4, side=8))
+    for frame in json.loads((tmp_path / "transforms.json").read_text())["frames"]:
+        (tmp_path / frame["file_path"]).parent.mkdir(exist_ok=True)
+        Image.new("RGB", (8, 8)).save(tmp_path / frame["file_path"])
+    small = hyrfpack.load_scene(tmp_path, max_size=4)
+    assert small.train[0].camera.width == 4
+    (tmp_path / "out").mkdir()
+    export(plain_file, tmp_path / "out" / "cameras.json", data=small)
+    content = json.loads((tmp_path / "out" / "cameras.json").read_text())
+    assert content["w"] == 8 and all((tmp_path / "out" / frame["file_path"]).exists() for frame in content["frames"])
+    export(plain_file, tmp_path / "colmap", data=small)
+    cameras = pycolmap.Reconstruction(tmp_path / "colmap" / "sparse" / "0").cameras
+    assert {camera.width for camera in cameras.values()} == {8}
 
 
 def test_a_colmap_export_writes_a_model_and_reports_its_size(plain_file, tmp_path):
