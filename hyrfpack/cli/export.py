@@ -216,6 +216,11 @@ def _print_report(report: ExportReport) -> None:
             f"the first row shows the loss by baking, the second the loss by baking and by the rounding of {rounding} "
             "together; neither compares with photos"
         )
+        if report.views_fitted:
+            click.echo(
+                "the file keeps so few cameras that colours were fitted at these views, too; other views have a lower "
+                "PSNR (name photos with --data to measure at held-out ones)"
+            )
     if report.psnr_by_exposure:
         _print_exposures(report)
     behind = f", {report.background:,} of them for the background" if report.background else ""

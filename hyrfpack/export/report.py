@@ -20,6 +20,8 @@ class ExportReport:
         chosen_by: scores by which the degree was chosen: for each degree, the PSNR of the baked model's pictures
             against the model's own at validation cameras. Empty if the degree was given.
         views: number of views at which the loss was measured; 0 if it was not measured.
+        views_fitted: whether colours were fitted at these views, too, because the file keeps few cameras. Their PSNR is
+            higher than that of other views.
         psnr_baked: PSNR of the baked model's pictures against the model's own, before numbers are rounded to the file's
             precision; None if it was not measured.
         psnr: PSNR of the file's pictures, as read back from its bytes, against the model's own.
@@ -47,6 +49,7 @@ class ExportReport:
     degree: int = 0
     chosen_by: dict[int, float] = field(default_factory=dict)
     views: int = 0
+    views_fitted: bool = False
     psnr_baked: float | None = None
     psnr: float | None = None
     photos_model: float | None = None

@@ -23,6 +23,8 @@ MAX_FIT_CAMERAS = 256  # because each camera takes memory and time
 MAX_MEASURED_VIEWS = 12
 HELD_OUT_INTERVAL = 8
 MIN_CAMERAS_TO_HOLD_OUT = 16
+# Coarse cameras are fitted together with many others, so that each of them matters less.
+MIN_COARSE_CAMERAS_TO_HOLD_OUT = 8
 VIEWS_BETWEEN_PER_CAMERA = 4
 RING_CAMERAS = 24
 RING_HEIGHTS_PER_DISTANCE = (-0.2, 0.0, 0.2)
@@ -41,7 +43,7 @@ class Source:
             keep no names, so without photos these are "camera-0000.png" and so on.
         fit_cameras: cameras at which colours are fitted; made-up ones around the scene if none are known.
         measured_views: cameras at which the loss is measured, with their photos or None. They are not fitted, unless
-            there are fewer than MIN_CAMERAS_TO_HOLD_OUT cameras in all.
+            the file keeps fewer than MIN_CAMERAS_TO_HOLD_OUT cameras, or MIN_COARSE_CAMERAS_TO_HOLD_OUT coarse ones.
         up: (3,) unit vector that points up in the scene.
         center: (3,) point at the centre of interest, world units.
         photo_mse: mean squared error of the model's pictures against its photos, as stated in the file.
@@ -93,19 +95,17 @@ class Source:
             measured_views = [(camera, None) for camera in between]
             return cls(model, drawn, [], _make_ring_cameras(viewpoint, center, up), measured_views, up, center, stated)
         named = [(f"camera-{number:04d}.png", camera) for number, camera in enumerate(cameras)]
-        spare = cameras[::HELD_OUT_INTERVAL] if len(cameras) >= MIN_CAMERAS_TO_HOLD_OUT else cameras
-        fit_cameras = (
-            [c for number, c in enumerate(cameras) if number % HELD_OUT_INTERVAL]
-            if len(cameras) >= MIN_CAMERAS_TO_HOLD_OUT
-            else cameras
-        )
+        spare = fit_cameras = cameras
+        if len(cameras) >= (MIN_COARSE_CAMERAS_TO_HOLD_OUT if capture.is_coarse else MIN_CAMERAS_TO_HOLD_OUT):
+            spare = cameras[::HELD_OUT_INTERVAL]
+            fit_cameras = [camera for number, camera in enumerate(cameras) if number % HELD_OUT_INTERVAL]
         measured_views = [(camera, None) for camera in evenly_spaced(spare, MAX_MEASURED_VIEWS)]
         if capture.is_coarse:
             # Coarse cameras are too few to fit harmonics, so cameras between them and around the scene are added.
             between = [
-                camera for seed in range(VIEWS_BETWEEN_PER_CAMERA) for camera in interpolate_views(cameras, seed)
+                camera for seed in range(VIEWS_BETWEEN_PER_CAMERA) for camera in interpolate_views(fit_cameras, seed)
             ]
-            fit_cameras = [*cameras, *between, *_make_ring_cameras(viewpoint, center, up)]
+            fit_cameras = [*fit_cameras, *between, *_make_ring_cameras(viewpoint, center, up)]
         return cls(
             model, drawn, named, fit_cameras, measured_views, _choose_up(cameras, up), center, stated, capture.is_coarse
         )

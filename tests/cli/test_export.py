@@ -61,6 +61,7 @@ def test_export_reports_its_steps_and_the_loss(model, tmp_path):
     names = ["baked to harmonics of degree 3, before writing", "read back from the .ply file"]
     assert [name.rstrip() for name, _ in rows] == names
     assert result.stdout.splitlines()[0].split("  ")[0] == "against renders of the model, 4 views"
+    assert "colours were fitted at these views" in result.stdout
     last = f"{tmp_path / 'a.ply'}: {size:,} bytes, {len(splats):,} Gaussians, {len(splats) - 40:,} of them for the"
     assert result.stdout.splitlines()[-1] == f"{last} background"
     notes = [line for line in result.stderr.splitlines() if not line.startswith("export | ")]  # progress of a slow call

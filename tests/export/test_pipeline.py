@@ -121,6 +121,12 @@ def test_a_single_gaussian_is_exported(ending, tmp_path):
     assert np.allclose(read_back(tmp_path / f"one{ending}").positions, [[0.1, 0.2, 0.3]], atol=2e-4)
 
 
+@pytest.mark.parametrize(("count", "is_fitted"), [(4, True), (16, False)])
+def test_the_report_says_if_an_export_is_measured_where_it_was_fitted(count, is_fitted, tmp_path):
+    source = write_model(tmp_path / "m.hyrf", small_model(GAUSSIAN_POSITIONS), ring(count, width=8, height=8))
+    assert export(source, tmp_path / "a.ply", degree=0).views_fitted == is_fitted
+
+
 def test_points_files_contain_centers_and_cameras(plain_file, tmp_path):
     report = export(plain_file, tmp_path / "a.points.ply")
     cloud = trimesh.load(tmp_path / "a.points.ply")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes import ball_scene, ring, small_model
 
-from hyrfpack.cameras.capture import provenance_cameras
+from hyrfpack.cameras.capture import provenance_cameras, quantized_provenance
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.source import MAX_MEASURED_VIEWS, MIN_CAMERAS_TO_HOLD_OUT, Source
@@ -54,6 +54,14 @@ def test_measured_cameras_are_not_fitted(count, write_model):
     )
     assert not fitted & measured and 2 <= len(measured) <= MAX_MEASURED_VIEWS
     assert len(source.cameras) == count and len(fitted) == count - len(range(0, count, 8))
+
+
+@pytest.mark.parametrize(("count", "measured_count"), [(7, 7), (8, 1), (14, 2)])
+def test_measured_coarse_cameras_are_not_fitted(count, measured_count, write_model):
+    source = Source.read(write_model(quantized_provenance(ring_provenance(count), 1.0)))
+    measured = [camera for camera, _ in source.measured_views]
+    assert source.has_coarse_cameras and len(measured) == measured_count
+    assert len(set(source.fit_cameras) & set(measured)) == (count if count < 8 else 0)
 
 
 def test_few_cameras_are_all_fitted(write_model):
