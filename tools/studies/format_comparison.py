@@ -351,10 +351,7 @@ def main() -> None:
         f"{args.data.name}: {len(model):,} Gaussians; PSNR trained {measure.trained[0]:.2f}; baked {baked}", flush=True
     )
     with tempfile.TemporaryDirectory() as folder:
-        rows = [
-            measure.measure_own_file(*file)
-            for file in compress_with_profiles(args.model, args.measure_own_file, Path(folder))
-        ]
+        rows = [measure.measure_own_file(*file) for file in compress_with_profiles(args.model, args.ours, Path(folder))]
     for number, setting in enumerate(settings):
         rows.append(measure.measure_peer(setting))
         print(f"{number + 1}/{len(settings)} {format_table(rows[-1:], len(model)).splitlines()[-1]}", flush=True)
