@@ -134,7 +134,7 @@ def _describe(path: Path, report_progress: Progress) -> PhotoSurvey:
 
     problems += find_count_problems(len(photos), scene, len(posed), path)
     problems += unreadable_sentences(unreadable, len(photos))
-    problems += find_copy_problems(photos, measurements, folder, report_progress)
+    problems += find_copy_problems(photos, measurements, unreadable, folder, report_progress)
     problems += find_blur_problems(measurements, blurred, folder)
     problems += find_light_problems(measurements, light, stops, folder, scene)
     if scene is None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Container
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -54,23 +56,32 @@ def find_count_problems(count: int, scene: Scene | None, posed: int, path: Path)
 def find_copy_problems(
     photos: list[Path],
     measurements: list[PhotoMeasurement],
+    unreadable: Container[str],
     folder: Path,
     report_progress: Progress,
 ) -> list[str]:
-    """Describe copies of photos, or a set that shows the same picture throughout."""
+    """Describe copies of photos, or a set that shows the same picture throughout.
+
+    `unreadable` are the names of photos below `folder` that cannot be read. They are not compared.
+    """
     thumbnails = np.stack([measurement.thumbnail for measurement in measurements])
     if len(measurements) > 2 and np.abs(thumbnails - thumbnails[0]).mean(axis=(1, 2)).max() < _SAME_PICTURE_MAX_LEVELS:
         return ["all photos show the same picture; walk around and take photos from many places"]
     sizes: dict[int, list[Path]] = {}
     for photo in photos:
-        sizes.setdefault(photo.stat().st_size, []).append(photo)
+        if relative_name(photo, folder) not in unreadable:
+            with suppress(OSError):  # of large sets, some photos have not been opened before
+                sizes.setdefault(photo.stat().st_size, []).append(photo)
     seen: dict[bytes, Path] = {}
     copies = []
     suspects = [item for group in sizes.values() if len(group) > 1 for item in group]
     for done, photo in enumerate(suspects):
         compared = f"searching for identical photos {done + 1}/{len(suspects)}"
         report_progress(TaskEvent(compared, PIXELS_PROGRESS + (1 - PIXELS_PROGRESS) * done / len(suspects)))
-        digest = hashlib.sha256(photo.read_bytes()).digest()
+        try:
+            digest = hashlib.sha256(photo.read_bytes()).digest()
+        except OSError:
+            continue
         if digest in seen:
             copies.append((photo, seen[digest]))
         seen.setdefault(digest, photo)

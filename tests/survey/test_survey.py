@@ -91,6 +91,28 @@ def test_blurred_dark_and_copied_photos_are_named(photos):
     assert "012 (1).jpg" in copy and "012.jpg" in copy
 
 
+def test_unreadable_photos_are_not_called_copies(photos):
+    for name in ("030.jpg", "031.jpg"):
+        (photos / name).write_bytes(b"")
+    survey = describe_photos(photos)
+    assert "030.jpg" in find_problem(survey, "cannot be read")
+    assert not any("copy of another" in sentence for sentence in survey.problems)
+
+
+def test_photos_that_become_unreadable_do_not_end_the_search_for_copies(photos, monkeypatch):
+    shutil.copy(photos / "001.jpg", photos / "001 (1).jpg")
+    shutil.copy(photos / "002.jpg", photos / "002 (1).jpg")
+    read_bytes = Path.read_bytes
+
+    def deny_some(path: Path) -> bytes:
+        if path.name.startswith("001"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return read_bytes(path)
+
+    monkeypatch.setattr(Path, "read_bytes", deny_some)
+    assert "002.jpg of 002 (1).jpg" in find_problem(describe_photos(photos), "1 photo is a copy")
+
+
 def test_a_completely_blurred_set_is_detected(photos):
     for number in range(24):
         save_photo(photos / f"{number:03d}.jpg", ndimage.gaussian_filter(random_rectangles(number), (4, 4, 0)))
