@@ -3,6 +3,8 @@
     python -m tools.studies.count_laws --sets mipnerf360_bonsai --sizes 400 200 --counts 8000 16000 32000 64000
     python -m tools.studies.count_laws --table --survey results          prints the table, and writes CSV files
 
+Runs are kept in --out/SET/STEPS/SIZE/COUNT. Those that are there are not repeated.
+
 The first table has one row for each run: PSNR (dB) and SSIM of the compact file on held-out photos, its bytes, and its
 bits per Gaussian of positions, of the other properties, of the hash tables, and of decoders and metadata. The second
 has, for each photo size, the least-squares fit of PSNR = a + b log2(N), and of the bytes by N.
@@ -83,6 +85,12 @@ def measure(data: Path, size: int, count: int, steps: int, folder: Path, lpips_w
     return row
 
 
+def has_row(folder: Path, needs_lpips: bool) -> bool:
+    """Return whether a run has been measured, and with LPIPS if that is needed."""
+    path = folder / ROW_FILE
+    return path.exists() and (not needs_lpips or json.loads(path.read_text())["lpips"] is not None)
+
+
 def read_rows(out: Path) -> list[CountRow]:
     """Return the rows of all runs below `out`, by size, the largest first, and by number of Gaussians."""
     rows = [CountRow(**json.loads(path.read_text())) for path in out.glob(f"*/*/{ROW_FILE}")]
@@ -142,11 +150,11 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="train nothing, and print what --out has")
     args = parser.parse_args()
     for name in args.sets:
-        out = args.out / name
+        out = args.out / name / str(args.steps)
         for size in () if args.table else args.sizes:
             for count in args.counts:
                 folder = out / str(size) / str(count)
-                if not (folder / ROW_FILE).exists():
+                if not has_row(folder, needs_lpips=args.lpips_weights is not None):
                     measure(args.data / name, size, count, args.steps, folder, args.lpips_weights)
         rows = read_rows(out)
         print(f"{name}\n\n{format_rows(rows)}\n\n{format_fits(rows)}\n")

@@ -32,9 +32,9 @@ def train(data: Path, out: Path, processes: int, options: Sequence[str]) -> dict
     return json.loads((out / "metrics.json").read_text())
 
 
-def format_row(name: str, processes: int, metrics: dict, environment: dict) -> list[str]:
-    """Format the row of a run, compared with the run on one process."""
-    scores, first = metrics["evaluation"], environment["evaluation"]
+def format_row(name: str, processes: int, metrics: dict, baseline: dict) -> list[str]:
+    """Format the row of a run, compared with the metrics of a baseline: the run on the first number of processes."""
+    scores, first = metrics["evaluation"], baseline["evaluation"]
     exchange = metrics["stage_seconds"].get("exchange", 0.0)
     return [
         name,
@@ -44,7 +44,7 @@ def format_row(name: str, processes: int, metrics: dict, environment: dict) -> l
         f"{scores['ssim']:.4f} ({scores['ssim'] - first['ssim']:+.4f})",
         f"{metrics['seconds']:.0f}",
         f"{exchange / metrics['seconds']:.1%}",
-        f"{environment['seconds'] / metrics['seconds'] / processes:.2f}",
+        f"{baseline['seconds'] / metrics['seconds'] / processes:.2f}",
     ]
 
 
@@ -62,7 +62,7 @@ def main(arguments: list[str] | None = None) -> None:
         runs = {
             count: train(
                 options.data / name,
-                options.out / f"{name}-{options.seed}-{count}",
+                options.out / f"{name}-{options.steps}-{options.seed}-{count}",
                 count,
                 ["--steps", str(options.steps), "--seed", str(options.seed)],
             )

@@ -7,7 +7,8 @@
 
 The columns are PSNR in dB, SSIM, numbers of Gaussians, bytes, losses in dB, seconds of compression, training steps per
 second, training seconds, and ms per frame. Scores are those of the decoded files on held-out views (every 8th;
-Blender-style sets have their own split). Runs are kept in --out (runs/sets/<steps>), and --reuse only measures them.
+Blender-style sets have their own split). Runs are kept in --out (runs/sets/<steps>), and --reuse only measures
+those with the same --steps and --seed, and --exposure or --no-exposure if one is given.
 """
 
 from __future__ import annotations
@@ -29,10 +30,19 @@ COMPRESSED_PROFILES = ("paper", "compact")
 DATA_FOLDER = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[3] / "shared" / "data")
 
 
+def has_run(out: Path, config: TrainConfig) -> bool:
+    """Return whether a folder has a run with these steps, this seed and, unless pilot runs decide, this exposure."""
+    if not (out / "metrics.json").exists():
+        return False
+    settings = json.loads((out / "metrics.json").read_text())["settings"]
+    names = ["steps", "seed"] + (["exposure"] if config.exposure is not None else [])
+    return all(settings[name] == getattr(config, name) for name in names)
+
+
 def measure(data: Path, name: str, out: Path, config: TrainConfig, reuse: bool) -> dict:
     """Train one data set, compress the model with each lossy profile, and score all files; return the row."""
     scene = load_variant(data, name)
-    if not (reuse and (out / "metrics.json").exists()):
+    if not (reuse and has_run(out, config)):
         hyrfpack.train_model(scene, out, config, overwrite=True)
     trained = json.loads((out / "metrics.json").read_text())
     model = out / "model.hyrf"

@@ -26,12 +26,12 @@ def load_runs(runs: Path, data: Path, names: Sequence[str] | None = None) -> Ite
     Args:
         runs: folder of the data sets' runs.
         data: folder of the data sets.
-        names: the data sets; None for all below `runs`.
+        names: the data sets; None for all folders below `runs`.
 
     Raises:
         FileNotFoundError: a data set has no run.
     """
-    for name in names or sorted(path.name for path in runs.iterdir()):
+    for name in names or sorted(path.name for path in runs.iterdir() if path.is_dir()):
         model_files = sorted((runs / name).glob(f"**/{MODEL_FILE}"))
         if not model_files:
             raise FileNotFoundError(f"{runs / name}: no run with a {MODEL_FILE}")

@@ -1,0 +1,60 @@
+"""Studies take finished runs only for the settings with which they were made."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+
+import pytest
+
+from hyrfpack.demo.scene import write_demo_scene
+from hyrfpack.train import TrainConfig
+from tools.studies import count_laws, processes
+from tools.studies.train_sets import has_run
+from tools.studies.trained_runs import load_runs
+
+
+def test_files_beside_the_folders_of_runs_are_ignored(tmp_path):
+    write_demo_scene(tmp_path / "data" / "demo", views=4, size=8)
+    (tmp_path / "runs" / "demo").mkdir(parents=True)
+    (tmp_path / "runs" / "demo" / "model.hyrf").touch()
+    (tmp_path / "runs" / "table.json").touch()
+    assert [name for name, _, _ in load_runs(tmp_path / "runs", tmp_path / "data")] == ["demo"]
+
+
+@pytest.mark.parametrize(
+    ("change", "is_same"),
+    [({}, True), ({"steps": 9}, False), ({"seed": 1}, False), ({"exposure": True}, False), ({"exposure": None}, True)],
+)
+def test_a_run_is_reused_only_with_its_settings(change, is_same, tmp_path):
+    config = TrainConfig(steps=5, exposure=False)
+    assert not has_run(tmp_path, config)
+    (tmp_path / "metrics.json").write_text(json.dumps({"settings": config.to_dict()}))
+    assert has_run(tmp_path, replace(config, **change)) == is_same
+
+
+def test_runs_of_other_steps_have_other_folders(tmp_path, monkeypatch):
+    metrics = {"evaluation": {"psnr": 1, "ssim": 1}, "stage_seconds": {}, "gaussians": 1, "seconds": 1}
+    folders = []
+    monkeypatch.setattr(processes, "train", lambda data, out, count, options: folders.append(out) or metrics)
+    for steps in ("10", "20"):
+        processes.main(["--sets", "a", "--steps", steps, "--processes", "1", "--out", str(tmp_path)])
+    assert len(set(folders)) == 2
+
+
+def test_counts_are_measured_again_for_other_steps_and_for_a_missing_lpips(tmp_path, monkeypatch, capsys):
+    calls = []
+
+    def measure(data, size, count, steps, folder, lpips_weights):
+        folder.mkdir(parents=True, exist_ok=True)
+        calls.append((steps, lpips_weights is not None))
+        lpips = None if lpips_weights is None else 0.5
+        found = count_laws.CountRow(size, count, 1000, 20.0, 0.5, lpips, positions=4, properties=3, tables=2, rest=1)
+        (folder / count_laws.ROW_FILE).write_text(json.dumps(asdict(found)))
+
+    monkeypatch.setattr(count_laws, "measure", measure)
+    for options in ([], [], ["--steps", "9"], ["--lpips-weights", "w.pth"], ["--lpips-weights", "w.pth"]):
+        command = ["count_laws", "--sizes", "400", "--counts", "8", "16", "--out", str(tmp_path), *options]
+        monkeypatch.setattr("sys.argv", command)
+        count_laws.main()
+    assert calls == [(3000, False)] * 2 + [(9, False)] * 2 + [(3000, True)] * 2
