@@ -74,9 +74,9 @@ def train_and_score(
     is the share of the bytes of the version's default file that the scored file may have; 1 for that file itself.
     """
     suffix = "" if size == 1 else f"-{size:g}"
-    scores_file = out / f"scores{suffix}.json"
-    if scores_file.exists():
-        return json.loads(scores_file.read_text())
+    is_better = out / f"scores{suffix}.json"
+    if is_better.exists():
+        return json.loads(is_better.read_text())
     cpu_time = out / "cpu_seconds.json"  # The last file of a training.
     if not cpu_time.exists():
         settings = ["--steps", str(steps), "--seed", str(seed), "--overwrite", *options]
@@ -96,7 +96,7 @@ def train_and_score(
         "seconds": json.loads(cpu_time.read_text()),
         "gaussians": json.loads((out / "metrics.json").read_text())["gaussians"],
     }
-    scores_file.write_text(json.dumps(result))
+    is_better.write_text(json.dumps(result))
     return result
 
 
@@ -131,10 +131,10 @@ def bytes_change_at_equal_psnr(ours: np.ndarray, theirs: np.ndarray) -> float | 
     for points in (ours, theirs):
         rising = points[np.argsort(points[:, 0])]
         best = np.maximum.accumulate(rising[:, 1])  # a larger file with a lower PSNR is not worth using
-        scores_file = np.concatenate(([True], np.diff(best) > 0))
-        if scores_file.sum() < 2:
+        is_better = np.concatenate(([True], np.diff(best) > 0))
+        if is_better.sum() < 2:
             return None
-        curve = PchipInterpolator(best[scores_file], np.log(rising[scores_file, 0]))
+        curve = PchipInterpolator(best[is_better], np.log(rising[is_better, 0]))
         means.append(curve.integrate(low, high) / (high - low))
     return float(np.exp(means[0] - means[1]) - 1)
 

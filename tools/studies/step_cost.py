@@ -38,10 +38,10 @@ def resample_gaussians(model: HybridModel, count: int) -> HybridModel:
     """Return the model with `count` evenly selected Gaussians; repeated ones get a random offset of their own size."""
     available, generator = len(model), torch.Generator().manual_seed(0)
     chosen = torch.arange(count) * available // count if count <= available else torch.arange(count) % available
-    part, command = model.subset(chosen), torch.arange(count) >= available
+    part, is_repeated = model.subset(chosen), torch.arange(count) >= available
     with torch.no_grad():
-        scales = model.decode_geometry().scales[chosen[command]]
-        part.gaussians.positions[command] += scales * torch.randn(len(scales), 3, generator=generator)
+        scales = model.decode_geometry().scales[chosen[is_repeated]]
+        part.gaussians.positions[is_repeated] += scales * torch.randn(len(scales), 3, generator=generator)
     return part
 
 
