@@ -62,7 +62,7 @@ def choose_grid(
     sizes = np.concatenate([sizes for _, sizes in sampled])
     if not len(points):
         raise HyrfError("no camera sees a surface, so there is no mesh", fix="name the photos with `data`")
-    low, high = _default_box(points, center, np.array([depth_map.camera.position for depth_map in maps]))
+    low, high = choose_default_box(points, center, np.array([depth_map.camera.position for depth_map in maps]))
     if crop is not None:
         limits = np.asarray(crop, np.float64)
         low, high = (
@@ -108,7 +108,7 @@ def _format_sides(sides: np.ndarray) -> str:
     return " x ".join(f"{side:.3g}" for side in sides)
 
 
-def _default_box(points: np.ndarray, center: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def choose_default_box(points: np.ndarray, center: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners (3,) of the box around what cameras at `positions` (N, 3) see near the centre."""
     reach = np.median(np.linalg.norm(positions - center, axis=1))
     near = np.linalg.norm(points - center, axis=1) <= reach

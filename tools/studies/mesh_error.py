@@ -6,7 +6,8 @@
 `demo` takes a model of the built-in scene, whose photos `hyrfpack.demo.scene.write_demo_scene` writes, and compares its
 mesh with the spheres, boxes and the ground that were photographed. Accuracy is the distance from the mesh to the
 nearest surface, completeness the distance from what the cameras see to the mesh, both in world units, and the normal
-error is the angle between a triangle and the nearest surface. `tools.studies.depth_error` measures rendered depths.
+error is the angle between a triangle and the nearest surface. Completeness is measured in the box that an export would
+choose for the true surfaces, the same for every mesh. `tools.studies.depth_error` measures rendered depths.
 
 `points` compares depths in held-out views with the points of the reconstruction that were found there: of the mesh, and
 of the model's own expected and median depth. Points are trained on as initial Gaussians, so they are not independent.
@@ -28,9 +29,11 @@ import trimesh
 from scipy.spatial import cKDTree
 
 import hyrfpack
+from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.demo.scene import NO_HIT_DISTANCE, SOLID_SHAPES, find_nearest_hit
 from hyrfpack.export.source import Source
 from hyrfpack.mesh import Mesh, extract_mesh
+from hyrfpack.mesh.bounds import choose_default_box
 from hyrfpack.mesh.depth_maps import render_depth_maps
 from hyrfpack.mesh.extract import MAX_MAPS
 from hyrfpack.ops.rasterize import RasterSettings, cpu
@@ -129,6 +132,17 @@ def demo_depth(camera: Camera) -> np.ndarray:
     return depth.reshape(camera.height, camera.width)
 
 
+def is_in_box(points: np.ndarray, scene: Scene) -> np.ndarray:
+    """Return whether known surface points (N, 3) lie in the box (N,) that an export would choose for these surfaces.
+
+    The box depends on the points and the cameras alone, so that all meshes of a scene are compared at the same points.
+    """
+    cameras = [view.camera for view in scene.train]
+    positions = np.array([camera.position for camera in cameras])
+    low, high = choose_default_box(points, Viewpoint.from_cameras(cameras).center, positions)
+    return ((points >= low) & (points <= high)).all(axis=1)
+
+
 def print_demo_error(mesh: Mesh, scene: Scene) -> None:
     """Print accuracy, completeness and normal error of a mesh of the demo scene."""
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
@@ -136,8 +150,7 @@ def print_demo_error(mesh: Mesh, scene: Scene) -> None:
     accuracy, normals = nearest_surface(samples)
     angles = np.degrees(np.arccos(np.clip((shape.face_normals[faces] * normals).sum(axis=1), -1, 1)))
     seen = np.concatenate([seen_points(view.camera) for view in scene.train])
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    seen = seen[((seen >= low) & (seen <= high)).all(axis=1)]
+    seen = seen[is_in_box(seen, scene)]
     completeness, _ = cKDTree(samples).query(seen)
     precision, recall = (accuracy < HIT_LIMIT).mean(), (completeness < HIT_LIMIT).mean()
     rows = [
@@ -189,12 +202,12 @@ def print_point_error(source: Source, mesh: Mesh, scene: Scene) -> None:
     """Print the errors of depths at the points that were found in held-out views, relative to the depth."""
     errors: dict[str, list[np.ndarray]] = {}
     shares: dict[str, list[np.ndarray]] = {}
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    near = is_in_box(scene.points, scene)
     for view in scene.test:
-        points = scene.points[scene.tracks[view.name]]
+        tracks = scene.tracks[view.name]
+        points = scene.points[tracks[near[tracks]]]
         u, v, z = view.camera.project(points)
         inside = (z > 0) & (u >= 0) & (v >= 0) & (u < view.camera.width) & (v < view.camera.height)
-        inside &= ((points >= low) & (points <= high)).all(axis=1)
         rows, columns, z = v[inside].astype(int), u[inside].astype(int), z[inside]
         depths = {"mesh": draw_depth(mesh, view.camera), **render_depths(source, view.camera)}
         for name, depth in depths.items():
