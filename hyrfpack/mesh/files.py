@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import logging
+import math
+
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.mesh.extract import Mesh
 from hyrfpack.splats.formats.gltf import GLTF_UP, linear_from_srgb
 from hyrfpack.splats.placement import local_origin, upright_rotation
+
+_LOG = logging.getLogger(__name__)
 
 MESH_EXTENSIONS = ("glb", "ply", "obj", "stl")
 _UNLIT_EXTENSION = "KHR_materials_unlit"  # colours of photos have the light in them already
@@ -19,8 +24,9 @@ def encode_mesh(mesh: Mesh, extension: str, up: np.ndarray) -> bytes:
     - A .glb has linear vertex colours, normals, and a material without light. Its node turns the mesh upright, and
       translates it if it lies far from the origin compared to its size. Without colours, it has positions alone.
     - A .ply has sRGB vertex colours, and float64 positions where float32 would be too coarse.
-    - A .obj has sRGB vertex colours, if there are any, after the positions, which most programs read.
-    - A .stl has no colours, and float32 positions.
+    - A .obj has sRGB vertex colours, if there are any, after the positions, which most programs read. Positions
+      have as many digits as the mesh's size needs.
+    - A .stl has no colours, and float32 positions. A warning says if these are too coarse.
 
     Args:
         mesh: the mesh.
@@ -40,7 +46,15 @@ def encode_mesh(mesh: Mesh, extension: str, up: np.ndarray) -> bytes:
         return _encode_glb(mesh, local, origin, up)
     if extension == "ply":
         return _encode_ply(mesh, local if not origin.any() else mesh.vertices)
-    return _encode_obj(mesh) if extension == "obj" else _encode_stl(mesh)
+    if extension == "obj":
+        return _encode_obj(mesh)
+    if origin.any():
+        step = np.spacing(np.abs(mesh.vertices).max().astype(np.float32))
+        _LOG.warning(
+            f".stl holds float32 positions, which far from the origin are multiples of {step:.2g} units: choose "
+            "another format, or move the scene to the origin first"
+        )
+    return _encode_stl(mesh)
 
 
 def _encode_glb(mesh: Mesh, local: np.ndarray, origin: np.ndarray, up: np.ndarray) -> bytes:
@@ -83,7 +97,11 @@ def _encode_ply(mesh: Mesh, positions: np.ndarray) -> bytes:
 
 
 def _encode_obj(mesh: Mesh) -> bytes:
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
+    # Nine digits are as fine as float32. Far from the origin, the first of them do not tell positions apart.
+    reach, size = np.abs(mesh.vertices).max(), np.ptp(mesh.vertices, axis=0).max()
+    digits = 9 + math.floor(math.log10(reach / size)) if reach > size > 0 else 9
+    number = f".{min(digits, 17)}g"
+    lines = [f"v {x:{number}} {y:{number}} {z:{number}}" for x, y, z in mesh.vertices.tolist()]
     if mesh.colors is not None:
         colors = (f" {red:.4f} {green:.4f} {blue:.4f}" for red, green, blue in (mesh.colors / 255).tolist())
         lines = [line + color for line, color in zip(lines, colors, strict=True)]

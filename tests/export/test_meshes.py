@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,7 +69,14 @@ def test_a_mesh_far_from_the_origin_keeps_its_shape(extension):
     far = Mesh(TETRAHEDRON_MESH.vertices + shift, *list(vars(TETRAHEDRON_MESH).values())[1:])
     read = read_mesh(encode_mesh(far, extension, UP), extension)
     edges = np.linalg.norm(read.vertices - read.vertices[0], axis=1)
-    np.testing.assert_allclose(edges, [0, 1, 2, 3], atol=0.02 if extension == "obj" else 1e-4)
+    np.testing.assert_allclose(edges, [0, 1, 2, 3], atol=1e-4)
+
+
+def test_an_stl_far_from_the_origin_is_reported_as_coarse(caplog):
+    encode_mesh(TETRAHEDRON_MESH, "stl", UP)
+    assert not caplog.messages
+    encode_mesh(replace(TETRAHEDRON_MESH, vertices=TETRAHEDRON_MESH.vertices + 5.3e6), "stl", UP)
+    assert [message for message in caplog.messages if "multiples of 0.5 units: choose another format" in message]
 
 
 def test_export_writes_the_surface_of_a_model(tmp_path):
