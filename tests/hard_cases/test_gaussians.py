@@ -419,6 +419,27 @@ def test_a_centre_at_or_behind_the_near_plane_is_not_drawn(implementation: str, 
 
 
 @pytest.mark.parametrize("implementation", ["cpu", "reference"])
+@pytest.mark.parametrize("distance", [1e18, -1e18, 1e25, -1e25])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_centre_farther_off_axis_than_an_integer_of_pixels_is_not_drawn(
+    implementation: str, distance: float, axis: int
+) -> None:
+    mean = tuple(distance if i == axis else 1.0 for i in range(3))
+    alone = _make_between_ordinary()
+    mixed = _make_between_ordinary((mean, (0.5, 0.5, 0.5), IDENTITY_QUATERNION, 0.9))
+    mixed["colors"][[0, 2]] = alone["colors"]
+
+    expected, expected_gradients = _run(Case(alone), implementation, torch.float32)
+    found, gradients = _run(Case(mixed), implementation, torch.float32)
+
+    assert found.visible.tolist() == [True, False, True]
+    assert torch.equal(found.rgb, expected.rgb) and torch.equal(found.transmittance, expected.transmittance)
+    for name in PARAMETER_NAMES:
+        assert not gradients[name][1].any()
+        assert torch.equal(gradients[name][[0, 2]], expected_gradients[name])
+
+
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
 def test_a_centre_one_step_beyond_the_near_plane_is_drawn(implementation: str) -> None:
     depth = float(np.nextafter(np.float32(0.25), np.float32(1)))
     case = Case(_make_between_ordinary(((0.0, 0.0, depth), (5.0, 5.0, 5.0), IDENTITY_QUATERNION, 0.9)), {"near": 0.25})

@@ -94,8 +94,12 @@ def _span(center, slope, rest, reach, inv_var, turn, low, high):
 
 @_kernel
 def _pixel_range(low, high, last):
-    """Return the first and last pixel in 0 to last whose centre, minus half a pixel, lies in [low, high]."""
-    return np.int64(math.ceil(max(low, 0.0))), np.int64(math.floor(min(high, np.float64(last))))
+    """Return the first and last pixel in 0 to last whose centre, minus half a pixel, lies in [low, high].
+
+    The first exceeds the last if there is none. Bounds are clamped as floats, because they may exceed every integer.
+    """
+    first = math.ceil(min(max(low, 0.0), last + 1.0))
+    return np.int64(first), np.int64(math.floor(max(min(high, np.float64(last)), -1.0)))
 
 
 @_kernel

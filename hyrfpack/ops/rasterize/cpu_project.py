@@ -213,8 +213,13 @@ def project(start, stop, gaussians, settings, projection):
         cut = 2 * math.log(255 * opacity)
         reach = cut + 1e-3
         extent_x, extent_y = math.sqrt(reach * xx) + 0.01, math.sqrt(reach * yy) + 0.01
-        left, right = max(mean_x - extent_x - 0.5, 0.0), min(mean_x + extent_x - 0.5, width - 1.0)
-        top, bottom = max(mean_y - extent_y - 0.5, 0.0), min(mean_y + extent_y - 0.5, height - 1.0)
+        left, right = mean_x - extent_x - 0.5, mean_x + extent_x - 0.5
+        top, bottom = mean_y - extent_y - 0.5, mean_y + extent_y - 0.5
+        # Bounds beyond the picture are compared as floats, because they may exceed every integer.
+        if not (left <= width - 1.0 and right >= 0.0 and top <= height - 1.0 and bottom >= 0.0):
+            continue
+        left, right = max(left, 0.0), min(right, width - 1.0)
+        top, bottom = max(top, 0.0), min(bottom, height - 1.0)
         if not (math.ceil(left) <= math.floor(right) and math.ceil(top) <= math.floor(bottom)):
             continue
         columns = np.int64(right) // TILE_SIZE - np.int64(math.ceil(left)) // TILE_SIZE + 1
