@@ -81,3 +81,18 @@ def test_an_import_upwards_or_across_is_found(text):
 def test_the_package_imports_neither_tools_nor_tests():
     known = {name.partition(".")[0] for path in PACKAGE_FOLDER.rglob("*.py") for _, name in read_imports(path)}
     assert "numpy" in known and not known & {"tools", "tests"}
+
+
+def test_compiled_kernels_take_constants_and_functions_from_their_own_package():
+    """Their machine code on disk is stamped with the sources of this package (`hyrfpack.parallel.compiled`)."""
+    kernel_files = [
+        path for path in list_modules() if re.search(r"^@(_kernel|_inlined|njit)$", path.read_text(), re.MULTILINE)
+    ]
+    own = {path: ("hyrfpack.parallel.", f"hyrfpack.{package_of(path)}.") for path in kernel_files}
+    assert len(kernel_files) > 5
+    assert [
+        f"{path}:{line}: {name}"
+        for path in kernel_files
+        for line, name in read_imports(path)
+        if name.startswith("hyrfpack.") and not name.startswith(own[path])
+    ] == []

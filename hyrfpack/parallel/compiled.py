@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import sys
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +15,19 @@ from numba.core.caching import FunctionCache
 
 
 class _TolerantCache(FunctionCache):
-    """Numba's disk cache of one function, which ignores write errors: the compiled kernel is already in memory."""
+    """Numba's disk cache of one function, for the sources of its whole package, which ignores write errors.
+
+    Machine code contains the constants and functions that a kernel takes from other modules, of which Numba checks
+    none. Kernels therefore take them from their own package: that of the first two names of their module, such as
+    `hyrfpack.ops`.
+
+    Write errors can be ignored because the compiled kernel is already in memory.
+    """
+
+    def __init__(self, function):
+        super().__init__(function)
+        package = ".".join(function.__module__.split(".")[:2])
+        self._cache_file._source_stamp = self._cache_file._source_stamp, _source_digest(package)
 
     def save_overload(self, sig, data):
         try:
@@ -22,6 +37,17 @@ class _TolerantCache(FunctionCache):
             # loaded by the next process, so the index is removed.
             with suppress(OSError):
                 Path(self._cache_file._index_path).unlink()
+
+
+@cache
+def _source_digest(package: str) -> str:
+    """Return a digest of all Python files of an imported package, as they were at the first call."""
+    digest = hashlib.sha256()
+    for folder in getattr(sys.modules.get(package), "__path__", ()):  # A module that is no package has none.
+        for path in sorted(Path(folder).rglob("*.py")):
+            with suppress(OSError):  # Lock files of editors are links to nothing.
+                digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def can_cache_kernels() -> bool:
