@@ -147,6 +147,23 @@ def test_the_faces_of_the_cube_belong_to_the_cells_inside(implementation: str) -
     )
 
 
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
+@pytest.mark.parametrize("far", [1e7, -1e7, 1e12, -1e12])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_nearest_cell_is_extrapolated_to_any_distance(implementation: str, far: float, axis: int) -> None:
+    """On a level of 512 vertices, a coordinate of 1e7 exceeds every 32-bit integer."""
+    coords, resolutions = _uniform(20, 3, seed=3), (5, 512)
+    coords[:, axis] = far
+    table = 2 * _uniform(level_offsets(resolutions, 9)[-1], 2, seed=1) - 1
+
+    expected = hash_encode(coords.double(), table.double(), resolutions, 9)
+    features = hash_encode(coords, table, resolutions, 9, implementation=implementation)
+
+    for level in (slice(0, 2), slice(2, 4)):
+        scale = expected[:, level].abs().max()
+        torch.testing.assert_close(features[:, level].double(), expected[:, level], rtol=0, atol=1e-4 * scale)
+
+
 def test_a_hundred_thousand_points_in_one_cell_add_up() -> None:
     coords, upstream = torch.full((100_000, 3), 0.37), _uniform(100_000, 8, seed=3)
 

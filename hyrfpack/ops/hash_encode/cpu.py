@@ -31,6 +31,14 @@ _FLOAT32_1 = np.float32(1)
 
 
 @njit
+def _cell(x, last):
+    """Return the cell, in 0 to last, of a coordinate that is scaled to the level."""
+    # A coordinate outside the cube may exceed every integer, and NaN passes the comparisons of floats.
+    nearest = min(max(x, np.float32(0)), np.float32(last))
+    return min(max(np.int32(nearest), np.int32(0)), last)
+
+
+@njit
 def _locate_corners(coords, start, count, resolution, mask, rows, fractions):
     """Compute the rows of the 8 corners and the position inside the cell for a block of points.
 
@@ -43,9 +51,9 @@ def _locate_corners(coords, start, count, resolution, mask, rows, fractions):
     for j in range(count):
         j = np.uint64(j)
         x, y, z = coords[_0, start + j] * span, coords[_1, start + j] * span, coords[_2, start + j] * span
-        cell_x = min(max(np.int32(x), np.int32(0)), last)
-        cell_y = min(max(np.int32(y), np.int32(0)), last)
-        cell_z = min(max(np.int32(z), np.int32(0)), last)
+        cell_x = _cell(x, last)
+        cell_y = _cell(y, last)
+        cell_z = _cell(z, last)
         fractions[j] = x - np.float32(cell_x)
         fractions[j + _BLOCK_STRIDE] = y - np.float32(cell_y)
         fractions[j + _2 * _BLOCK_STRIDE] = z - np.float32(cell_z)
