@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import inf, isnan
 from time import perf_counter
 
 import torch
@@ -33,7 +34,9 @@ def check_case(case: SelfTestCase, implementation: str, device: torch.device) ->
     for what, found, expected, bound in zip(("value", "gradient"), measured, exact, case.bounds, strict=True):
         for name, tensor in expected.items():
             error = _relative_error(found[name], tensor)
-            row[f"{what} error"] = max(error, float(str(row.get(f"{what} error", 0.0))))
+            # NaN counts as infinite, because the maximum of NaN and a later number may be that number.
+            shown = inf if isnan(error) else error
+            row[f"{what} error"] = max(shown, float(str(row.get(f"{what} error", 0.0))))
             if not error <= bound and "status" not in row:
                 of = f"the gradient of {name}" if what == "gradient" else name
                 row |= {"status": "failed", "note": f"{of} {_describe_error(error, bound)}"}
@@ -84,7 +87,7 @@ def _relative_error(found: Tensor, exact: Tensor) -> float:
 
 
 def _describe_error(error: float, bound: float) -> str:
-    if error != error:
+    if isnan(error):
         return "is NaN or infinite"
     if error == float("inf"):
         return "has the wrong shape"

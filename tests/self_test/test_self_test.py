@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from hyrfpack.parallel import has_numba
 from hyrfpack.parallel.child_items import ROW_PREFIX
 from hyrfpack.self_test import SelfTest, run_self_test, worker
 from hyrfpack.self_test import run as self_test_run
-from hyrfpack.self_test.cases import self_test_cases
+from hyrfpack.self_test.cases import Inputs, SelfTestCase, self_test_cases
 from hyrfpack.self_test.check import check_case
 from hyrfpack.self_test.worker import CACHE_FIX, INSTALL_FIX, explain_launch_failure
 
@@ -65,6 +66,24 @@ def test_kernels_pass_with_errors_far_below_their_bounds(name: str) -> None:
     row = check_case(case, "gpu", CPU_DEVICE)
     assert "status" not in row and row["value error"] < case.bounds[0] / 10
     assert ("gradient error" in row) == bool(case.gradient_inputs)
+
+
+def make_case(first: float, **attributes: bool) -> SelfTestCase:
+    """Return a case of two results, of which kernels return `first` and a right number, and the reference two ones."""
+
+    def run(implementation: str, inputs: Inputs) -> dict[str, torch.Tensor]:
+        return {
+            "first": torch.tensor([1.0 if implementation == "reference" else first]),
+            "second": torch.tensor([1.0 if implementation == "reference" else 1.0 + 2**-20]),
+        }
+
+    return SelfTestCase("contract", {}, run, **attributes)
+
+
+def test_a_result_of_nan_stays_the_largest_error_before_one_that_is_right() -> None:
+    row = check_case(make_case(math.nan), "cpu", CPU_DEVICE)
+    assert row["status"] == "failed" and row["note"] == "first is NaN or infinite"
+    assert row["value error"] == math.inf
 
 
 @needs_triton
