@@ -190,7 +190,7 @@ def _group_by_reason(failed: dict[str, Row]) -> str:
     """Return the failed operations, those with the same reason together."""
     groups: dict[str, list[str]] = {}
     for operation, row in failed.items():
-        speed = f"; plain torch is {row['slowdown']} times as slow on a small input" if "slowdown" in row else ""
+        speed = f"; plain torch takes {row['slowdown']} times as long on a small input" if "slowdown" in row else ""
         groups.setdefault(f"{row['note']}{speed}", []).append(operation)
     return ", ".join(f"{', '.join(operations)} ({reason})" for reason, operations in groups.items())
 

@@ -19,7 +19,8 @@ TIMED_RUNS = 3
 def check_case(case: SelfTestCase, implementation: str, device: torch.device) -> Row:
     """Return the largest errors of a case's results and gradients, the seconds that it took, and whether it failed.
 
-    If the kernels are wrong, the row also has "slowdown": how many times as long plain torch takes on this input.
+    If the kernels are wrong, the row also has "slowdown": how many times as long plain torch takes on this input. It is
+    left out if the reference runs no operation.
 
     Args:
         case: the operation and its inputs.
@@ -40,7 +41,7 @@ def check_case(case: SelfTestCase, implementation: str, device: torch.device) ->
             if not error <= bound and "status" not in row:
                 of = f"the gradient of {name}" if what == "gradient" else name
                 row |= {"status": "failed", "note": f"{of} {_describe_error(error, bound)}"}
-    if "status" in row:
+    if "status" in row and case.reference_runs:
         plain, kernels = (_median_seconds(case, name, device) for name in ("reference", implementation))
         row["slowdown"] = round(plain / kernels, 1)
     return row

@@ -29,9 +29,9 @@ class SelfTest:
         device: the tested device, as torch names it.
         rows: for each case its name ("item"), what a failure replaces ("operation", see
             `SelfTestCase.replaced_operation`), its errors and the seconds that it took with compilation.
-            A failed one has "status" "failed", the reason as "note", and if its kernels ran, as "slowdown" how many
-            times as long plain torch took. It has "is_temporary" True if it failed because of the machine's present
-            state: memory ran out, or its process ran out of time or was killed.
+            A failed one has "status" "failed", the reason as "note", and if its kernels and plain torch ran, as
+            "slowdown" how many times as long plain torch took. It has "is_temporary" True if it failed because of the
+            machine's present state: memory ran out, or its process ran out of time or was killed.
         problem: why no case could run; None if they ran.
         can_launch: False if the simplest kernel could not be compiled and launched, which is then the problem.
     """

@@ -86,6 +86,13 @@ def test_a_result_of_nan_stays_the_largest_error_before_one_that_is_right() -> N
     assert row["value error"] == math.inf
 
 
+@pytest.mark.parametrize("reference_runs", [True, False])
+def test_kernels_are_compared_in_time_only_with_a_reference_that_runs(reference_runs: bool) -> None:
+    row = check_case(make_case(2.0, reference_runs=reference_runs), "cpu", CPU_DEVICE)
+    assert row["status"] == "failed" and ("slowdown" in row) == reference_runs
+    assert not ALL_CASES["rasterize, replay"].reference_runs
+
+
 @needs_triton
 @needs_interpreter
 @pytest.mark.acceptance

@@ -74,7 +74,7 @@ def test_a_warning_names_what_is_replaced_once(gpu, runs, caplog):
         choose_device(name)
     (warning,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert "the kernels of 2 of 13 operations do not work on cuda:0 (a GPU that is not there)" in warning
-    assert "contract (coords is NaN; plain torch is 2.5 times as slow on a small input)" in warning
+    assert "contract (coords is NaN; plain torch takes 2.5 times as long on a small input)" in warning
     assert "mlp (its process ended by SIGSEGV)" in warning
     assert "'hyrfpack doctor'" in warning
 
