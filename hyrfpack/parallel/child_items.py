@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from math import inf
 from pathlib import Path
@@ -91,7 +91,11 @@ def signal_name(code: int) -> str:
 
 
 def run_in_children(
-    command: Callable[[list[str]], list[str]], items: Sequence[str], seconds: float, item_seconds: float = inf
+    command: Callable[[list[str]], list[str]],
+    items: Sequence[str],
+    seconds: float,
+    item_seconds: float = inf,
+    self_timed: Collection[str] = (),
 ) -> Iterator[Row]:
     """Run the items in one or more child processes, called from the parent; yield the rows of all items.
 
@@ -100,20 +104,25 @@ def run_in_children(
         items: the names of the items.
         seconds: time limit for all items together; unfinished items have failed.
         item_seconds: time limit for each item, and for the start of a child; the remaining items still run.
+        self_timed: names of items that keep a limit of their own, to which `item_seconds` does not apply.
     """
     remaining, end = list(items), time.monotonic() + seconds
+
+    def time_left(item: str) -> float:
+        return min(inf if item in self_timed else item_seconds, end - time.monotonic())
+
     while remaining:
         remaining_before, current, last_line = len(remaining), None, ""
         child = _Child(command(remaining))
         try:
-            child.limit_time(min(item_seconds, end - time.monotonic()))
+            child.limit_time(time_left(remaining[0]))
             for line in child.lines():
                 kind, _, rest = line.partition(" ")
                 if kind + " " == ROW_PREFIX:
                     yield json.loads(rest)
                 elif kind + " " == BEGUN_PREFIX:
                     current, last_line = rest, ""
-                    child.limit_time(min(item_seconds, end - time.monotonic()))
+                    child.limit_time(time_left(rest))
                 elif kind + " " == DONE_PREFIX:
                     remaining.remove(rest)
                     current = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shutil
@@ -11,6 +12,7 @@ import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -96,9 +98,9 @@ sys.exit(gpu_worker.run_child(run, sys.argv[1:], lambda: usable))
 """
 
 
-def run_children(*items: str, seconds: float = 20.0) -> dict[str, list[str]]:
+def run_children(*items: str, seconds: float = 20.0, **limits: Any) -> dict[str, list[str]]:
     """Return by item what its rows say: "fine", or the status and its reason."""
-    rows = run_in_children(lambda left: [sys.executable, "-c", CHILD_SCRIPT, *left], items, seconds)
+    rows = run_in_children(lambda left: [sys.executable, "-c", CHILD_SCRIPT, *left], items, seconds, **limits)
     results: dict[str, list[str]] = {}
     for row in rows:
         results.setdefault(row["item"], []).append(f"{row['status']}: {row['note']}" if "status" in row else "fine")
@@ -242,6 +244,26 @@ def test_a_hanging_item_is_reported_with_its_last_output() -> None:
     results = run_children("hangs in a test", "two", seconds=1.5)
     assert results["hangs in a test"][-1] == "failed: not done within the part's 2 s; last output: test_loop"
     assert results["two"] == ["failed: not done within the part's 2 s"]
+
+
+def test_the_limit_of_an_item_leaves_time_for_the_others_and_spares_items_with_their_own() -> None:
+    results = run_children("hangs", "two", "hangs in a test", seconds=9, item_seconds=3, self_timed=["hangs in a test"])
+    assert results["hangs"] == ["fine", "failed: not done within 3 s"]
+    assert results["two"] == ["fine"]
+    assert results["hangs in a test"][-1] == "failed: not done within the part's 9 s; last output: test_loop"
+
+
+def test_items_of_parts_with_many_items_have_limits_below_that_of_their_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = {}
+    monkeypatch.setattr(
+        gpu_check, "run_in_children", lambda command, items, *limits: calls.update({part: limits}) or ()
+    )
+    for part in gpu_check.DEFAULT_PARTS:
+        gpu_check.check([part], TINY_SETUP, scale=3.0)
+    assert calls["self-test"] == (420.0, 120.0, ("hyrfpack doctor",))
+    assert calls["tests"] == (450.0, 60.0, ("pytest",))
+    assert calls["repeat"] == (60.0, math.inf, ())
+    assert all(calls[part][1] < calls[part][0] / 1.9 for part in gpu_check.ITEM_SECONDS)
 
 
 def test_missing_packages_are_distinguished_from_internal_modules() -> None:

@@ -31,6 +31,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
+from math import inf
 from pathlib import Path
 
 # Without this, torch's CPU threads keep spinning and slow down the kernel that is timed next.
@@ -61,6 +62,9 @@ CHECK_PARTS = {
     "ranks": ("tools.gpu.ranks", 150.0),
     "full-run": ("tools.gpu.full_run", FULL_RUN_OVERHEAD_SECONDS),
 }
+# The time limit of each item in parts of many items, so that a kernel that hangs does not take the time of the others.
+# Items in the module's SELF_TIMED_ITEMS keep a limit of their own.
+ITEM_SECONDS = {"self-test": 40.0, "tests": 20.0, "kernels": 25.0, "frames": 45.0}
 DEFAULT_PARTS = ("self-test", "tests", "kernels", "frames", "sanitizer", "repeat")
 # The default parts end within this time, because some machines kill a command after 10 minutes.
 MAX_DEFAULT_SECONDS = 540.0
@@ -84,7 +88,7 @@ def check(
     rows: list[Row] = []
     for part in parts:
         start = time.monotonic()
-        for row in run_part(part, setup, scale * part_seconds(part, setup)):
+        for row in run_part(part, setup, scale * part_seconds(part, setup), scale * ITEM_SECONDS.get(part, inf)):
             rows.append({"part": part, **row})
             print(_format_row(rows[-1]), flush=True)
             report(rows)
@@ -99,10 +103,11 @@ def part_seconds(part: str, setup: Setup) -> float:
     return CHECK_PARTS[part][1] + (setup.full_run_seconds if part == "full-run" else 0.0)
 
 
-def run_part(part: str, setup: Setup, seconds: float) -> Iterator[Row]:
-    """Yield the rows of one part; `seconds` is its time limit."""
+def run_part(part: str, setup: Setup, seconds: float, item_seconds: float) -> Iterator[Row]:
+    """Yield the rows of one part; `seconds` is its time limit, and `item_seconds` that of each of its items."""
     try:
-        items = importlib.import_module(CHECK_PARTS[part][0]).items(setup)
+        module = importlib.import_module(CHECK_PARTS[part][0])
+        items = module.items(setup)
     except Exception as error:  # if a module is missing or broken, the other parts still run
         yield {"item": "", **failure_row(error)}
         return
@@ -110,7 +115,7 @@ def run_part(part: str, setup: Setup, seconds: float) -> Iterator[Row]:
     def command(remaining: list[str]) -> list[str]:
         return [sys.executable, "-m", "tools.gpu.check", "--worker", part, setup.to_json(), *remaining]
 
-    yield from run_in_children(command, items, seconds)
+    yield from run_in_children(command, items, seconds, item_seconds, getattr(module, "SELF_TIMED_ITEMS", ()))
 
 
 def run_child_items(part: str, setup: Setup, items: Sequence[str]) -> int:

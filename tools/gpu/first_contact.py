@@ -15,6 +15,7 @@ from tools.gpu.setup import Setup
 
 TABLE_NAME = "Self-test"
 DOCTOR_ITEM = "hyrfpack doctor"
+SELF_TIMED_ITEMS = (DOCTOR_ITEM,)
 DOCTOR_PROBLEM_PREFIX, DOCTOR_RESULT_PREFIX = "problem: ", "self-test: "
 
 

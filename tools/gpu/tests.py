@@ -18,6 +18,7 @@ from tools.gpu.suite import run_suite
 
 TABLE_NAME = "Right on this device"
 PYTEST_ITEM = "pytest"
+SELF_TIMED_ITEMS = (PYTEST_ITEM,)
 
 
 def items(setup: Setup) -> list[str]:
