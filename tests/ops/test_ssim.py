@@ -181,6 +181,32 @@ def test_a_completely_masked_picture_has_zero_loss(implementation: str) -> None:
     assert not gradient.any()
 
 
+@pytest.mark.skipif(not has_numba(), reason="no numba")
+@pytest.mark.parametrize("mask", ["no mask", "some pixels"])
+@pytest.mark.parametrize("case", PICTURE_PAIRS)
+def test_the_value_is_the_same_without_a_gradient_which_is_then_not_computed(
+    case: str, mask: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hyrfpack.ops.ssim import cpu
+
+    results = []
+
+    def note(*arguments: object) -> tuple[float, np.ndarray]:
+        results.append(compute(*arguments))
+        return results[-1]
+
+    compute = cpu.loss_and_gradient
+    monkeypatch.setattr(cpu, "loss_and_gradient", note)
+    image, target = PICTURE_PAIRS[case]
+    chosen = MASK_MAKERS[mask](image.shape[:2])
+
+    value = photometric_loss(image, target, chosen, implementation="cpu")
+    with_gradient = photometric_loss(image.clone().requires_grad_(), target, chosen, implementation="cpu")
+
+    assert value.item() == pytest.approx(with_gradient.item(), rel=1e-6)
+    assert [len(gradient) for _, gradient in results] == [0, len(image)]
+
+
 @pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
 def test_the_gradient_is_scaled_by_the_upstream_gradient(implementation: str) -> None:
     pictures = crop_for_interpreter(implementation, make_photo(40, 50), make_photo(40, 50, seed=1))

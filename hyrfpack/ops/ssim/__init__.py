@@ -111,9 +111,10 @@ class _CpuLoss(torch.autograd.Function):
             picture.detach().reshape(shape[0], -1).contiguous().numpy() for picture in (image, target)
         )
         loss, gradient = cpu.loss_and_gradient(
-            image_values, target_values, weights, l1_weight / count, ssim_weight / count
+            image_values, target_values, weights, l1_weight / count, ssim_weight / count, ctx.needs_input_grad[0]
         )
-        ctx.save_for_backward(torch.from_numpy(gradient).view(shape))
+        if ctx.needs_input_grad[0]:
+            ctx.save_for_backward(torch.from_numpy(gradient).view(shape))
         return image.new_tensor(loss)
 
     @staticmethod

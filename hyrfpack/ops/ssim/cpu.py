@@ -180,14 +180,24 @@ def _copy_row(pixels, row, start, count, buffer, target):
 
 
 @njit
+def _sum_differences(image, target, row, start, count):
+    """Return the sum of |x - y| along a row, from one float on."""
+    total = np.float32(0)
+    for j in range(count):
+        total += abs(image[row, start + j] - target[row, start + j])
+    return total
+
+
+@njit
 def _process_tile(image, target, weight, l1_scale, ssim_scale, top, bottom, left, right, grad, sums):
     """Compute the gradient and the sums of |x - y| and of SSIM for rows [top, bottom) and columns [left, right).
 
-    `weight` is 1 for values to include and 0 for others; if it has no rows, all values are included.
+    `weight` is 1 for values to include and 0 for others; if it has no rows, all values are included. If `grad` has no
+    rows, no gradient is computed.
     """
     buffer = np.zeros(_BUFFER_FLOATS, np.float32)
     height, floats = image.shape[0], image.shape[1]
-    weighted = weight.shape[0] == height
+    weighted, needs_gradient = weight.shape[0] == height, grad.shape[0] == height
     first_float = 3 * left
     tile_floats = 3 * (right - left)
     moment_floats = tile_floats + 6 * WINDOW_RADIUS
@@ -247,42 +257,48 @@ def _process_tile(image, target, weight, l1_scale, ssim_scale, top, bottom, left
                         for j in range(tile_floats):
                             row_sum += buffer[_SSIM_OFFSET + np.uint64(3 * WINDOW_RADIUS) + np.uint64(j)]
                         total_ssim += row_sum
-                    _blur_across(buffer, _BY_X_OFFSET, _DERIVATIVES_OFFSET + row_offset, padded_floats)
-                    _blur_across(
-                        buffer, _BY_SQUARE_OFFSET, _DERIVATIVES_OFFSET + _PLANE_FLOATS + row_offset, padded_floats
-                    )
-                    _blur_across(
-                        buffer,
-                        _BY_PRODUCT_OFFSET,
-                        _DERIVATIVES_OFFSET + _U2 * _PLANE_FLOATS + row_offset,
-                        padded_floats,
-                    )
+                        if not needs_gradient:
+                            total_l1 += _sum_differences(image, target, row, first_float, tile_floats)
+                    if needs_gradient:
+                        _blur_across(buffer, _BY_X_OFFSET, _DERIVATIVES_OFFSET + row_offset, padded_floats)
+                        _blur_across(
+                            buffer, _BY_SQUARE_OFFSET, _DERIVATIVES_OFFSET + _PLANE_FLOATS + row_offset, padded_floats
+                        )
+                        _blur_across(
+                            buffer,
+                            _BY_PRODUCT_OFFSET,
+                            _DERIVATIVES_OFFSET + _U2 * _PLANE_FLOATS + row_offset,
+                            padded_floats,
+                        )
                 else:
                     for plane in range(3):
                         _clear(
                             buffer, _DERIVATIVES_OFFSET + np.uint64(plane) * _PLANE_FLOATS + row_offset, padded_floats
                         )
 
-        for group in range(0, _ROWS_PER_STEP, _ROWS_PER_GROUP):
-            for plane in range(3):
-                source = _DERIVATIVES_OFFSET + np.uint64(plane) * _PLANE_FLOATS + np.uint64(group) * _ROW_FLOATS
-                _blur_down(buffer, source, _BLURRED_OFFSET + np.uint64(plane) * _BLURRED_PLANE_FLOATS, padded_floats)
-            for step in range(_ROWS_PER_GROUP):
-                row = base - WINDOW_RADIUS + group + step
-                if top <= row < bottom:
-                    row_offset = _BLURRED_OFFSET + np.uint64(step) * _ROW_FLOATS
-                    row_sum = np.float32(0)
-                    for j in range(tile_floats):
-                        x, y = image[row, first_float + j], target[row, first_float + j]
-                        i = row_offset + np.uint64(j)
-                        by_x, by_square = buffer[i], buffer[i + _BLURRED_PLANE_FLOATS]
-                        ssim_gradient = by_x + _TWO * x * by_square + y * buffer[i + _U2 * _BLURRED_PLANE_FLOATS]
-                        row_sum += abs(x - y)
-                        grad[row, first_float + j] = ssim_scale * ssim_gradient + l1_scale * np.sign(x - y)
-                    total_l1 += row_sum
-                    if weighted:
+        if needs_gradient:
+            for group in range(0, _ROWS_PER_STEP, _ROWS_PER_GROUP):
+                for plane in range(3):
+                    source = _DERIVATIVES_OFFSET + np.uint64(plane) * _PLANE_FLOATS + np.uint64(group) * _ROW_FLOATS
+                    _blur_down(
+                        buffer, source, _BLURRED_OFFSET + np.uint64(plane) * _BLURRED_PLANE_FLOATS, padded_floats
+                    )
+                for step in range(_ROWS_PER_GROUP):
+                    row = base - WINDOW_RADIUS + group + step
+                    if top <= row < bottom:
+                        row_offset = _BLURRED_OFFSET + np.uint64(step) * _ROW_FLOATS
+                        row_sum = np.float32(0)
                         for j in range(tile_floats):
-                            grad[row, first_float + j] *= weight[row, first_float + j]
+                            x, y = image[row, first_float + j], target[row, first_float + j]
+                            i = row_offset + np.uint64(j)
+                            by_x, by_square = buffer[i], buffer[i + _BLURRED_PLANE_FLOATS]
+                            ssim_gradient = by_x + _TWO * x * by_square + y * buffer[i + _U2 * _BLURRED_PLANE_FLOATS]
+                            row_sum += abs(x - y)
+                            grad[row, first_float + j] = ssim_scale * ssim_gradient + l1_scale * np.sign(x - y)
+                        total_l1 += row_sum
+                        if weighted:
+                            for j in range(tile_floats):
+                                grad[row, first_float + j] *= weight[row, first_float + j]
 
         for plane in range(4):
             _carry_rows(buffer, _MOMENTS_OFFSET + np.uint64(plane) * _PLANE_FLOATS)
@@ -292,7 +308,12 @@ def _process_tile(image, target, weight, l1_scale, ssim_scale, top, bottom, left
 
 
 def loss_and_gradient(
-    image: np.ndarray, target: np.ndarray, weight: np.ndarray | None, l1_weight: float, ssim_weight: float
+    image: np.ndarray,
+    target: np.ndarray,
+    weight: np.ndarray | None,
+    l1_weight: float,
+    ssim_weight: float,
+    needs_gradient: bool,
 ) -> tuple[float, np.ndarray]:
     """Compute the weighted sum of |image - target| and of 1 - SSIM over an image, and the gradient of `image`.
 
@@ -300,14 +321,16 @@ def loss_and_gradient(
         image, target: (H, 3W) float32, interleaved; equal where `weight` is 0.
         weight: (H, 3W) float32, 1 for values to include and 0 for others; None includes all.
         l1_weight, ssim_weight: factors of the two sums.
+        needs_gradient: whether to compute the gradient, which takes a third of the time.
 
     Returns:
-        The loss l1_weight * sum |x - y| + ssim_weight * sum (1 - SSIM), and its gradient (H, 3W) float32.
+        The loss l1_weight * sum |x - y| + ssim_weight * sum (1 - SSIM), and its gradient (H, 3W) float32; without
+        rows if it is not needed.
     """
     height, floats = image.shape
     width = floats // 3
     strips, tiles = -(-height // _MAX_TILE_ROWS), -(-width // _MAX_TILE_COLUMNS)
-    gradient = np.empty_like(image)
+    gradient = np.empty((height if needs_gradient else 0, floats), np.float32)
     sums = np.zeros((strips * tiles, 2))
     count = image.size if weight is None else np.count_nonzero(weight)
     weights = np.empty((0, 0), np.float32) if weight is None else weight
