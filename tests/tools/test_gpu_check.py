@@ -456,6 +456,10 @@ def test_a_slow_sanitizer_keeps_what_it_found_and_leaves_time_for_the_next_tool(
         assert "@done mlp" in (tmp_path / "logs" / f"{tool}.txt").read_text()
 
 
+def test_races_are_checked_in_all_operations_whose_kernels_multiply_matrices() -> None:
+    assert gpu_sanitizer.product_operations() == {"mlp", "shade", "background_grid", "rasterize_shaded"}
+
+
 def test_the_sanitizers_tools_and_pytest_keep_their_own_limits_within_those_of_their_parts() -> None:
     tools = sum(seconds + SECONDS_TO_END for seconds in gpu_sanitizer.TOOL_SECONDS.values())
     assert tools < gpu_check.CHECK_PARTS["sanitizer"][1]

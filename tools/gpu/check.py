@@ -54,9 +54,9 @@ FULL_RUN_OVERHEAD_SECONDS = 60.0  # what the full run takes besides its training
 CHECK_PARTS = {
     "self-test": ("tools.gpu.first_contact", 140.0),
     "tests": ("tools.gpu.tests", 150.0),
-    "kernels": ("tools.gpu.kernels", 50.0),
+    "kernels": ("tools.gpu.kernels", 45.0),
     "frames": ("tools.gpu.frames", 90.0),
-    "sanitizer": ("tools.gpu.sanitizer", 90.0),
+    "sanitizer": ("tools.gpu.sanitizer", 95.0),
     "repeat": ("tools.gpu.repeat", 20.0),
     "quality": ("tools.gpu.quality", 170.0),
     "ranks": ("tools.gpu.ranks", 150.0),
@@ -64,7 +64,7 @@ CHECK_PARTS = {
 }
 # The time limit of each item in parts of many items, so that a kernel that hangs does not take the time of the others.
 # Items in the module's SELF_TIMED_ITEMS keep a limit of their own.
-ITEM_SECONDS = {"self-test": 40.0, "tests": 20.0, "kernels": 25.0, "frames": 45.0}
+ITEM_SECONDS = {"self-test": 40.0, "tests": 20.0, "kernels": 22.0, "frames": 45.0}
 DEFAULT_PARTS = ("self-test", "tests", "kernels", "frames", "sanitizer", "repeat")
 # The default parts end within this time, because some machines kill a command after 10 minutes.
 MAX_DEFAULT_SECONDS = 540.0

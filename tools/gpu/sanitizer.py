@@ -19,9 +19,7 @@ TABLE_NAME = "compute-sanitizer"
 # The usual place of the tool, for machines whose PATH lacks it.
 DEFAULT_PROGRAM = Path("/usr/local/cuda/bin/compute-sanitizer")
 # The time limit of each tool, in the order in which they run. Together they fit into the part's time limit.
-TOOL_SECONDS = {"memcheck": 45.0, "racecheck": 22.0}
-# Only these kernels use shared memory explicitly or through matrix products.
-RACE_CHECK_OPERATIONS = ("mlp", "shade")
+TOOL_SECONDS = {"memcheck": 45.0, "racecheck": 33.0}
 _SUMMARY = re.compile(r"(?:ERROR|RACECHECK) SUMMARY: (\d+) (.*)")
 
 
@@ -42,7 +40,7 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
         }
         return
     cases = self_test_cases()
-    names = [name for name, case in cases.items() if item == "memcheck" or case.operation in RACE_CHECK_OPERATIONS]
+    names = [name for name, case in cases.items() if item == "memcheck" or case.operation in product_operations()]
     worker = [sys.executable, "-m", "hyrfpack.self_test.worker", setup.implementation, f"{setup.device}:0", *names]
     # torch's cache of memory would hide accesses between two tensors.
     environment = {**child_environment(), "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
@@ -54,6 +52,11 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
         yield row | {"status": "failed", "note": f"not done within {TOOL_SECONDS[item]:.0f} s; it printed: {found}"}
     else:
         yield row | describe_output(output, process.exit_code)
+
+
+def product_operations() -> set[str]:
+    """Return the operations whose kernels multiply matrices, through shared memory: those with mixed precision."""
+    return {case.operation for case in self_test_cases().values() if case.is_mixed}
 
 
 def count_checked_cases(output: str) -> int:
