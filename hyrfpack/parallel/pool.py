@@ -22,6 +22,8 @@ from hyrfpack.parallel.threads import thread_count
 S = TypeVar("S")
 T = TypeVar("T")
 
+# The largest size of kept blocks that older versions of glibc accept.
+MAX_OLD_MMAP_THRESHOLD_BYTES = 1 << 25
 
 _thread_state = threading.local()
 
@@ -76,7 +78,8 @@ def _set_kept_memory(nbytes: int) -> None:
     if (mallopt := getattr(_c_library(), "mallopt", None)) is not None:
         trim_threshold, mmap_threshold = -1, -3
         mallopt(trim_threshold, nbytes)
-        mallopt(mmap_threshold, nbytes)
+        if not mallopt(mmap_threshold, nbytes):
+            mallopt(mmap_threshold, MAX_OLD_MMAP_THRESHOLD_BYTES)
 
 
 @cache

@@ -12,6 +12,7 @@ from concurrent.futures import Future
 import pytest
 import torch
 
+from hyrfpack.parallel import pool
 from hyrfpack.parallel.pool import parallel_map, run_jobs, run_tasks
 
 
@@ -93,6 +94,24 @@ def test_torch_keeps_its_number_of_threads_outside_tasks() -> None:
     environment = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "HYRFPACK_THREADS"), "2")
     done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
     assert done.stdout == "2\n", done.stderr
+
+
+def test_a_c_library_with_a_limit_keeps_as_much_memory_as_it_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    mmap_threshold, limit = -3, 1 << 25
+    thresholds = []
+
+    class OldLibrary:
+        def mallopt(self, parameter: int, nbytes: int) -> int:
+            if parameter == mmap_threshold and nbytes > limit:
+                return 0
+            if parameter == mmap_threshold:
+                thresholds.append(nbytes)
+            return 1
+
+    monkeypatch.setattr(pool, "_c_library", OldLibrary)
+    with pool.freed_memory_kept():
+        assert thresholds == [limit]
+    assert thresholds == [limit, 1 << 20]
 
 
 MEMORY_SCRIPT = """
