@@ -119,6 +119,8 @@ def _add_table_grad(coords, grad, resolution, mask, grad_table):
         for j in range(count):
             j = np.uint64(j)
             grad0, grad1 = grad[_0, first + j], grad[_1, first + j]
+            if grad0 == 0 and grad1 == 0:  # as of Gaussians that no pixel shows
+                continue
             for c in range(8):
                 k = j + np.uint64(c) * _BLOCK_STRIDE
                 row = np.uint64(rows[k])

@@ -17,7 +17,7 @@ from hyrfpack.parallel.pool import run_tasks, torch_on_one_thread
 _MAX_ROWS_PER_CHUNK = 2048  # The activations of a chunk (0.5 MiB at width 64) then stay in the L2 cache.
 _MIN_ROWS_PER_CHUNK = 256
 # Above this ratio of rows without a gradient, gathering the other rows is faster than computing all of them.
-_MIN_IDLE_ROW_RATIO = 0.1
+_MIN_IDLE_ROW_RATIO = 0.2
 
 # Hidden activations of more rows are not stored; at width 64 and two hidden layers they would take 128 MiB.
 MAX_STORED_ROWS = 1 << 18
@@ -100,7 +100,8 @@ def backward(
             active = grads.any(dim=1).nonzero().squeeze(1)
             gathered = len(active) < (1 - _MIN_IDLE_ROW_RATIO) * (stop - start)
             if gathered:
-                grads, inputs = grads[active], [tensor[active] for tensor in inputs]
+                # For contiguous rows, `index_select` takes a fifth of the time of indexing.
+                grads, *inputs = (tensor.index_select(0, active) for tensor in (grads, *inputs))
             if not hidden:
                 inputs = _hidden_layers(inputs[0], weights, biases)
             for layer in reversed(range(len(weights))):
