@@ -5,9 +5,12 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import ipaddress
+import logging
 import os
 import re
 import socket
+import socketserver
 import sys
 import threading
 import webbrowser
@@ -19,11 +22,15 @@ from typing import Any, BinaryIO
 
 from hyrfpack.errors import HyrfError
 
-LOCAL_HOST = "127.0.0.1"
+_LOG = logging.getLogger(__name__)
+
+LOCAL_HOST, LOCAL_HOST_IPV6 = "127.0.0.1", "::1"
+# Addresses in other networks by IP version. They are reserved for documentation (RFC 5737, RFC 3849).
+_REMOTE_HOSTS = {4: "192.0.2.1", 6: "2001:db8::1"}
 BINARY_CONTENT_TYPE = "application/octet-stream"
 CHUNK_BYTES = 1 << 18  # bounds the memory that sending a large file takes
 SHUTDOWN_POLL_SECONDS = 0.1  # bounds the time that a server in a thread takes to end
-_RANGE_PATTERN = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
+_RANGE_PATTERN = re.compile(r"bytes=(\d{0,100})-(\d{0,100})", re.ASCII)  # int() refuses more than 4,300 digits
 
 
 class MemoryFile:
@@ -62,10 +69,12 @@ def serve(
     Args:
         page: HTML, UTF-8, which is served at "/".
         files: the files, by the name that follows "/" in their address.
-        host: address to listen at. Any other than the default lets other machines connect.
+        host: address to listen at. Any other than the default lets other
+            machines connect; if it stands for all addresses of the machine
+            ("0.0.0.0", "::"), one that they can open is logged.
         port: port to listen at, 0 to 65535; 0 takes a free one.
         open_browser: open the page in the user's browser.
-        on_ready: called with the page's address, once it can be opened.
+        on_ready: called with the page's address for this machine, once it can be opened.
 
     Raises:
         HyrfError: the server cannot listen at this address.
@@ -73,6 +82,8 @@ def serve(
     with _create_server(host, port, page, files or {}) as server:
         address = _page_address(host, server)
         on_ready(address)
+        if server.ip_address.is_unspecified:
+            _LOG.info(f"other machines can open {_network_address(server)}")
         if open_browser:  # in a thread, because opening some browsers blocks until they are closed
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
         with contextlib.suppress(KeyboardInterrupt):
@@ -101,13 +112,40 @@ def serve_in_thread(page: bytes, files: ServedFiles, *, port: int = 0) -> Iterat
 
 
 def _page_address(host: str, server: _Server) -> str:
-    name = f"[{host}]" if ":" in host else host
-    return f"http://{name}:{server.server_port}/"
+    """Return the page's address for this machine, at which a server for `host` listens."""
+    if server.ip_address.is_unspecified:  # browsers on Windows cannot open it
+        host = LOCAL_HOST if server.ip_address.version == 4 else LOCAL_HOST_IPV6
+    return f"http://{_host_in_address(host)}:{server.server_port}/"
+
+
+def _network_address(server: _Server) -> str:
+    """Return the page's address for other machines, which names this machine by its IP address, or else by its name."""
+    try:
+        with socket.socket(server.address_family, socket.SOCK_DGRAM) as probe:
+            probe.connect((_REMOTE_HOSTS[server.ip_address.version], 9))  # this only chooses a route, and sends nothing
+            host = probe.getsockname()[0]
+    except OSError:  # there is no route to other networks
+        host = socket.gethostname()
+    return f"http://{_host_in_address(host)}:{server.server_port}/"
+
+
+def _host_in_address(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
 
 
 class _Server(ThreadingHTTPServer):
     page = b""
     files: Mapping[str, Path | MemoryFile] = {}
+
+    @property
+    def ip_address(self) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+        """The address at which the server listens."""
+        return ipaddress.ip_address(str(self.server_address[0]))
+
+    def server_bind(self) -> None:
+        """Bind the socket; `HTTPServer` also looks up a name of the host, which may wait for a name server."""
+        socketserver.TCPServer.server_bind(self)
+        self.server_port = self.server_address[1]
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):  # the browser has closed the connection
@@ -212,6 +250,7 @@ def _create_server(host: str, port: int, page: bytes, files: ServedFiles) -> _Se
 
     class Server(_Server):
         address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        allow_reuse_address = os.name != "nt"  # with it, Windows lets several programs listen at one port
 
     if not host.strip():  # a socket would listen at every address
         raise HyrfError(

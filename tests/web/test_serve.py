@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import logging
 import os
 import signal
 import socket
@@ -10,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,10 @@ def send_request(
         return answer.status, dict(answer.headers), answer.read()
     finally:
         connection.close()
+
+
+def port_from_address(address: str) -> int:
+    return int(address.rstrip("/").rpartition(":")[2])
 
 
 def test_only_the_page_and_its_file_are_served(port, scene_file):
@@ -102,7 +107,8 @@ def test_a_range_beyond_the_end_is_refused_with_the_length(byte_range, port):
 
 
 @pytest.mark.parametrize(
-    "byte_range", ["bytes=9-5", "bytes=", "bytes=-", "bytes=a-b", "lines=0-1", "bytes=0-1,5-6", "٣-٤"]
+    "byte_range",
+    ["bytes=9-5", "bytes=", "bytes=-", "bytes=a-b", "lines=0-1", "bytes=0-1,5-6", "٣-٤", f"bytes={'9' * 5000}-"],
 )
 def test_an_invalid_range_is_ignored(byte_range, port):
     status, _, body = send_request(port, Range=byte_range.encode().decode("latin-1"))
@@ -194,6 +200,69 @@ def test_a_port_in_use_is_reported_in_one_sentence():
             serve(PAGE_HTML, port=port, open_browser=False, on_ready=lambda address: None)
 
 
+def test_on_windows_no_second_program_can_listen_at_the_same_port(monkeypatch: pytest.MonkeyPatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "name", "nt")
+        server = serving._create_server("127.0.0.1", 0, PAGE_HTML, {})
+    with server:
+        assert server.socket.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR) == 0
+
+
+def test_serve_looks_up_no_name_of_the_host(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(socket, "getfqdn", None)
+    with serving.serve_in_thread(PAGE_HTML, {}) as address:
+        assert send_request(port_from_address(address), "/")[2] == PAGE_HTML
+
+
+def skip_without_ipv6(host: str) -> None:
+    if ":" in host:
+        try:
+            socket.create_server((host, 0), family=socket.AF_INET6).close()
+        except OSError:
+            pytest.skip("there is no IPv6 here")
+
+
+def replaced_getsockname(network_host: str) -> Callable[[socket.socket], tuple]:
+    """Return a `getsockname` with which UDP sockets have this address."""
+    getsockname = socket.socket.getsockname
+    return lambda self: (network_host, 1) if self.type == socket.SOCK_DGRAM else getsockname(self)
+
+
+@pytest.mark.parametrize(
+    ("host", "local_name", "network_name"), [("0.0.0.0", "127.0.0.1", "198.51.100.7"), ("::", "[::1]", "[2001:db8::7]")]
+)
+def test_a_server_for_all_addresses_names_one_for_this_machine_and_one_for_others(
+    host: str, local_name: str, network_name: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    opened, said = [], []
+    skip_without_ipv6(host)
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setattr(serving._Server, "serve_forever", lambda server: None)
+    monkeypatch.setattr(socket.socket, "connect", lambda probe, address: None)
+    monkeypatch.setattr(socket.socket, "getsockname", replaced_getsockname(network_name.strip("[]")))
+    with caplog.at_level(logging.INFO, "hyrfpack"):
+        serve(PAGE_HTML, host=host, open_browser=True, on_ready=said.append)
+    port = port_from_address(said[0])
+    assert said == opened == [f"http://{local_name}:{port}/"]
+    assert caplog.messages == [f"other machines can open http://{network_name}:{port}/"]
+
+
+def test_without_a_network_the_server_names_its_machine(monkeypatch, caplog):
+    def no_route(probe: socket.socket, address: tuple) -> None:
+        raise OSError("Network is unreachable")
+
+    said = []
+    monkeypatch.setattr(serving._Server, "serve_forever", lambda server: None)
+    monkeypatch.setattr(socket.socket, "connect", no_route)
+    monkeypatch.setattr(socket, "gethostname", lambda: "studio")
+    with caplog.at_level(logging.INFO, "hyrfpack"):
+        serve(PAGE_HTML, host="0.0.0.0", open_browser=False, on_ready=said.append)
+    assert caplog.messages == [f"other machines can open http://studio:{port_from_address(said[0])}/"]
+
+
+# -- addresses that cannot be used -------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize("host", ["192.0.2.1", "no such name", "a" * 70])
 def test_an_unusable_host_is_reported_in_one_sentence(host):
     with pytest.raises(HyrfError, match=rf"^nothing can listen at port 0 of {host} [^\n]*$"):
@@ -227,10 +296,6 @@ def test_a_closed_connection_prints_nothing(capsys: pytest.CaptureFixture, monke
 
 
 # -- files in memory ---------------------------------------------------------------------------------------------------
-
-
-def port_from_address(address: str) -> int:
-    return int(address.rstrip("/").rpartition(":")[2])
 
 
 def test_a_file_in_memory_is_served_whole_and_in_ranges():
