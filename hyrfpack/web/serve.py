@@ -25,6 +25,8 @@ from hyrfpack.errors import HyrfError
 _LOG = logging.getLogger(__name__)
 
 LOCAL_HOST, LOCAL_HOST_IPV6 = "127.0.0.1", "::1"
+# Names by which browsers of this machine open the page, also through a forwarded port.
+_LOCAL_NAMES = frozenset({LOCAL_HOST, "localhost", f"[{LOCAL_HOST_IPV6}]"})
 # Addresses in other networks by IP version. They are reserved for documentation (RFC 5737, RFC 3849).
 _REMOTE_HOSTS = {4: "192.0.2.1", 6: "2001:db8::1"}
 BINARY_CONTENT_TYPE = "application/octet-stream"
@@ -69,8 +71,9 @@ def serve(
     Args:
         page: HTML, UTF-8, which is served at "/".
         files: the files, by the name that follows "/" in their address.
-        host: address to listen at. Any other than the default lets other
-            machines connect; if it stands for all addresses of the machine
+        host: address to listen at. At an address of this machine alone, such as the default, the server refuses
+            requests that name another host, so that no website can read the page through the user's browser (DNS
+            rebinding). Any other address lets other machines connect; if it stands for all addresses of the machine
             ("0.0.0.0", "::"), one that they can open is logged.
         port: port to listen at, 0 to 65535; 0 takes a free one.
         open_browser: open the page in the user's browser.
@@ -136,6 +139,7 @@ def _host_in_address(host: str) -> str:
 class _Server(ThreadingHTTPServer):
     page = b""
     files: Mapping[str, Path | MemoryFile] = {}
+    allowed_hosts: frozenset[str] | None = None  # in the header Host of requests, without the port; None for any
 
     @property
     def ip_address(self) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
@@ -158,6 +162,13 @@ class _Handler(BaseHTTPRequestHandler):
     server: _Server
 
     def do_GET(self) -> None:
+        if not self._is_host_allowed():
+            self.send_error(
+                HTTPStatus.FORBIDDEN,
+                explain="Only browsers of this machine can open this page, by the name localhost. "
+                "To open it on another machine, forward its port (ssh -L).",
+            )
+            return
         path = self.path.partition("?")[0]
         if path == "/":
             self._send_headers(HTTPStatus.OK, "text/html; charset=utf-8", len(self.server.page))
@@ -169,6 +180,11 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(HTTPStatus.NOT_FOUND)
 
     do_HEAD = do_GET
+
+    def _is_host_allowed(self) -> bool:
+        """Return whether the server may answer for the host that the request names. Browsers always name one."""
+        allowed, requested = self.server.allowed_hosts, self.headers.get("Host")
+        return allowed is None or requested is None or re.sub(r":\d*$", "", requested.strip()).lower() in allowed
 
     def _send_file(self, served: Path | MemoryFile) -> None:
         try:
@@ -270,6 +286,8 @@ def _create_server(host: str, port: int, page: bytes, files: ServedFiles) -> _Se
             f"nothing can listen at port {port} of {host} ({reason})",
             fix="name another port or host",
         ) from error
+    if server.ip_address.is_loopback:
+        server.allowed_hosts = _LOCAL_NAMES | {_host_in_address(host).lower()}
     server.page = page
     server.files = {f"/{name}": file if isinstance(file, MemoryFile) else Path(file) for name, file in files.items()}
     return server

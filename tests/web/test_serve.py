@@ -260,6 +260,47 @@ def test_without_a_network_the_server_names_its_machine(monkeypatch, caplog):
     assert caplog.messages == [f"other machines can open http://studio:{port_from_address(said[0])}/"]
 
 
+# -- the header Host ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", ["/", "/scene.hyrf", "/other"])
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "localhost.evil.example", "127.0.0.1.evil:1", ""])
+def test_a_request_for_another_host_is_refused(host, path, port):
+    status, headers, body = send_request(port, path, Host=host)
+    assert status == 403 and b"by the name localhost" in body and "ETag" not in headers
+    assert send_request(port, path, "HEAD", Host=host)[::2] == (403, b"")
+
+
+@pytest.mark.parametrize(
+    "host", ["localhost", "LocalHost:1234", "127.0.0.1:{port}", "127.0.0.1:8080", "[::1]", "[::1]:9"]
+)
+def test_a_request_for_this_machine_is_answered_also_through_a_forwarded_port(host, port):
+    assert send_request(port, Host=host.format(port=port))[::2] == (200, FILE_DATA)
+
+
+def test_a_request_that_names_no_host_is_answered(port):
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as client:
+        client.sendall(b"GET / HTTP/1.0\r\n\r\n")
+        assert client.makefile("rb").read().endswith(PAGE_HTML)
+
+
+def test_any_host_is_answered_if_other_machines_can_connect():
+    with serving._create_server("0.0.0.0", 0, PAGE_HTML, {}) as server:
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+        assert send_request(server.server_port, "/", Host="studio.local")[0] == 200
+        server.shutdown()
+
+
+def test_a_name_of_this_machine_that_the_user_gave_is_answered(monkeypatch: pytest.MonkeyPatch):
+    bind = socket.socket.bind
+    monkeypatch.setattr(socket.socket, "bind", lambda self, address: bind(self, ("127.0.0.1", address[1])))
+    with serving._create_server("Studio", 0, PAGE_HTML, {}) as server:
+        threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()
+        assert send_request(server.server_port, "/", Host=f"studio:{server.server_port}")[0] == 200
+        assert send_request(server.server_port, "/", Host="studio.local")[0] == 403
+        server.shutdown()
+
+
 # -- addresses that cannot be used -------------------------------------------------------------------------------------
 
 
