@@ -40,11 +40,12 @@ export class MergedEvaluator {
   }
 
   /**
-   * See ViewEvaluator.
-   * @param {View} view
-   * @param {Uint32Array | null} spare
+   * Sorts the Gaussians by their depth in a view.
+   * @param {View} view in local units
+   * @param {Uint32Array | null} spare an earlier order, to be overwritten
    */
   sort(view, spare) {
+    // The picture is enlarged, so that no Gaussians are missing at its edges until the next order arrives.
     const sides = frustumPlanes(view, 1 + CULL_MARGIN_RATIO);
     return this.sorter.sort([...view.rows[2], view.translation[2]], sides, NEAR_PLANE_LOCAL, spare);
   }

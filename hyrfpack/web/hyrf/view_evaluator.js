@@ -1,11 +1,10 @@
 // Evaluates a model for one viewpoint after the other, row by row, so that what a view needs most comes first.
 
 import { BACKGROUND_RADIUS, backgroundColors, colorsAlong, decodeGeometry, firstLayers } from "./fields.js";
-import { CULL_MARGIN_RATIO, NEAR_PLANE_LOCAL, frustumPlanes } from "./frustum.js";
+import { CULL_MARGIN_RATIO, frustumPlanes } from "./frustum.js";
 import { rotateBack, rowsOf } from "./rotation.js";
 import { RowStates, rowBalls } from "./row_states.js";
 import { backgroundSpacing, pixelSizes } from "./sampling.js";
-import { DepthSort } from "./sort.js";
 import { mul } from "./vectors.js";
 
 /** The number of Gaussians of a row, which are evaluated together. */
@@ -62,7 +61,6 @@ export class ViewEvaluator {
    */
   constructor(model, withSky = true) {
     this.model = model;
-    this.sorter = new DepthSort(model.positions, GAUSSIANS_PER_ROW);
     this.rows = new RowStates(model.count ? rowBalls(model.positions, GAUSSIANS_PER_ROW) : new Float32Array(0));
     this.pixelSizes = pixelSizes(model.positions, model.metadata);
     this.opacities = new Float32Array(model.count);
@@ -72,17 +70,6 @@ export class ViewEvaluator {
     this.tiles = this.sky ? cutTiles(this.sky.width, this.sky.height, false) : [];
     this.tileStates = new RowStates(Float32Array.from(this.tiles.flatMap(({ ball }) => ball)));
     this.hasCoarseSky = !this.sky;
-  }
-
-  /**
-   * Sorts the Gaussians by their depth in a view.
-   * @param {View} view in local units
-   * @param {Uint32Array | null} spare an earlier order, to be overwritten
-   */
-  sort(view, spare) {
-    // The picture is enlarged, so that no Gaussians are missing at its edges until the next order arrives.
-    const sides = frustumPlanes(view, 1 + CULL_MARGIN_RATIO);
-    return this.sorter.sort([...view.rows[2], view.translation[2]], sides, NEAR_PLANE_LOCAL, spare);
   }
 
   /**

@@ -29,9 +29,9 @@ export declare class MergedEvaluator {
     /** @param {import("./index.js").Model[]} models */
     constructor(models: import("./index.js").Model[]);
     /**
-     * See ViewEvaluator.
-     * @param {View} view
-     * @param {Uint32Array | null} spare
+     * Sorts the Gaussians by their depth in a view.
+     * @param {View} view in local units
+     * @param {Uint32Array | null} spare an earlier order, to be overwritten
      */
     sort(view: View, spare: Uint32Array | null): {
         order: Uint32Array;

@@ -1,5 +1,4 @@
 import { RowStates } from "./row_states.js";
-import { DepthSort } from "./sort.js";
 /** The number of Gaussians of a row, which are evaluated together. */
 export declare const GAUSSIANS_PER_ROW = 2048;
 /** The number of floats that describe the shape of a Gaussian: its position and three axes. */
@@ -54,7 +53,6 @@ export type SkySize = {
 export declare function skySize(metadata: import("./metadata.js").Metadata): SkySize | null;
 export declare class ViewEvaluator {
     model: import("./index.js").Model;
-    sorter: DepthSort;
     rows: RowStates;
     pixelSizes: Float32Array<ArrayBufferLike>;
     opacities: Float32Array<ArrayBuffer>;
@@ -69,15 +67,6 @@ export declare class ViewEvaluator {
      * @param {boolean} [withSky] whether its background is evaluated, if it has one
      */
     constructor(model: Model, withSky?: boolean);
-    /**
-     * Sorts the Gaussians by their depth in a view.
-     * @param {View} view in local units
-     * @param {Uint32Array | null} spare an earlier order, to be overwritten
-     */
-    sort(view: View, spare: Uint32Array | null): {
-        order: Uint32Array;
-        drawn: number;
-    };
     /**
      * Evaluates, one at a time, what a view needs: first what is in view and was never evaluated, then what has changed
      * most, and in the end everything at this very viewpoint. Rows out of view come last, after `onComplete` was called.
