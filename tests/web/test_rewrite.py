@@ -12,9 +12,10 @@ import pytest
 from web.scripts import run_script
 
 from hyrfpack.cli.edit import edit
-from hyrfpack.format.container import Container
+from hyrfpack.format.container import Container, Section
 from hyrfpack.format.metadata import read_metadata, writer_name
-from hyrfpack.format.sections import METADATA
+from hyrfpack.format.sections import EXPOSURE, METADATA, POSITIONS, SHAPES, layer_section
+from hyrfpack.format.versions import lowest_minor_version
 
 GOLDEN_FOLDER = Path(__file__).parents[1] / "golden"
 FILES = [
@@ -105,3 +106,22 @@ def test_a_saved_file_equals_that_of_the_command(name: str, edits: str, saved, m
             assert saved_file.entries[section].codec == written.entries[section].codec
         assert_equal_numbers(vars(read_metadata(saved_file)), vars(read_metadata(written)))
     assert target.read_bytes()[:16] == written_file.read_bytes()[:16]  # with the format version
+
+
+def test_the_minor_version_of_a_saved_file_is_that_of_python(tmp_path: Path):
+    frames: tuple[dict, ...] = ({}, {"rotation": [1, 0, 0, 0]})
+    configs = [{"frame": frame, **more} for frame in frames for more in ({}, {"residual_degree": 1})]
+    types = (POSITIONS, layer_section(POSITIONS, 1), SHAPES, layer_section(SHAPES, 1), EXPOSURE)
+    cases = [
+        {"sections": [{"type": METADATA, "codec": 0}, {"type": kind, "codec": codec}], "config": config}
+        for kind, codec, config in product(types, range(16), configs)
+    ]
+    (tmp_path / "cases.json").write_text(json.dumps(cases))
+    found = run_script(Path(__file__).with_name("minor_versions.mjs"), tmp_path / "cases.json")
+    expected = [
+        lowest_minor_version(
+            [Section(data=b"", raw_length=0, **section) for section in case["sections"]], case["config"]
+        )
+        for case in cases
+    ]
+    assert found == expected and set(expected) == {0, 1, 2, 3, 5, 6}

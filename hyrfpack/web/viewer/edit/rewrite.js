@@ -9,7 +9,7 @@ import { moveMetadata } from "./moved_metadata.js";
 
 const METADATA_OPTIONS = ["up", "upright", "scale"];
 const CODEC_JSON = 0, CODEC_FLOAT32 = 1, CODEC_DEFLATED = 5;
-const COMPACT_CODECS = [5, 6, 7, 8];
+const COMPACT_CODECS = [5, 6, 7, 8], SHARED_CODECS = [11, 12];
 const REQUIRED_FLAG = 1;
 
 // Returns whether actions remove no Gaussians.
@@ -73,11 +73,14 @@ async function deflate(bytes) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-// As in hyrfpack/format/versions.py.
-function lowestMinorVersion(entries, { frame, residual_degree: degree }) {
+// Returns the lowest minor version that has the sections of a file and its configuration, as in
+// hyrfpack/format/versions.py.
+export function lowestMinorVersion(entries, { frame, residual_degree: degree }) {
   if (degree !== undefined) return 6;
-  if (frame.rotation) return 3;
-  if (entries.some(({ type }) => type === EXPOSURE_TYPE)) return 2;
-  const isLater = (type) => /^(POS|COL|SCA|OPA)\d$/.test(type);
-  return Number(entries.some(({ type, codec }) => COMPACT_CODECS.includes(codec) || isLater(type)));
+  return Math.max(...entries.map(({ type, codec }) => {
+    if (SHARED_CODECS.includes(codec)) return 5;
+    if (frame.rotation) return 3;
+    if (type === EXPOSURE_TYPE) return 2;
+    return Number(COMPACT_CODECS.includes(codec) || /\d$/.test(type)); // a digit is the number of a later layer
+  }));
 }
