@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -14,6 +15,7 @@ from hyrfpack.web.player import encode_player
 
 pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
 PHONE_OPTIONS = {"dense": 2.0, "phone": True}
+SCENE_FOLDER = Path(__file__).parents[1] / "golden" / "scene"
 HTML_DATA = b"\xef\xbb\xbf\n<!doctype html><title>Sorry</title>" * 20
 
 
@@ -166,6 +168,15 @@ def test_a_page_with_a_model_inside_reports_other_files_by_what_they_are(browser
     browser.evaluate("hyrfpack.ready")
     drop_file(browser, encode_picture("JPEG"), "photo.jpg")
     assert wait_for_message(browser) == "photo.jpg cannot be opened: it is a JPEG picture and no scene."
+
+
+def test_a_dropped_manifest_of_a_scene_folder_is_recognised(browser: Browser, host: Site):
+    browser.open(f"{host.address}/index.html")
+    browser.evaluate("hyrfpack.ready")
+    drop_file(browser, (SCENE_FOLDER / "scene.json").read_bytes(), "scene.json")
+    message = wait_for_message(browser)
+    assert message.startswith("scene.json cannot be opened: it is only the list of a scene folder; serve the folder")
+    assert "hyrfpack view FOLDER" in message
 
 
 def test_a_sandboxed_frame_says_that_the_sandbox_forbids_the_request(browser: Browser, host: Site):

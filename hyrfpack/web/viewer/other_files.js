@@ -4,10 +4,13 @@ import { HyrfFormatError } from "../hyrf/errors.js";
 
 const TESTED_BYTES = 256;
 // Patterns are long enough that the numbers of a .splat file, which has no header, practically never match.
+// Texts may begin with a byte order mark.
 const OTHER_KINDS = [
-  [/^(\xef\xbb\xbf)?\s*<(!doctype html|html|head|body|script)/i,
+  [/^\W*<(!doctype html|html|head|body|script)/i,
     "a web page (HTML) and no scene; its server may have answered with an error page, so check the address"],
-  [/^(\xef\xbb\xbf)?\s*<\?xml/i, "an XML text and no scene; its server may have answered with an error"],
+  [/^\W*<\?xml/i, "an XML text and no scene; its server may have answered with an error"],
+  [/^\s*\{\s*"background":/, // the first key of a scene.json, because they are sorted
+    "only the list of a scene folder; serve the folder, or use 'hyrfpack view FOLDER'"],
   [/^\s*\{\s*"\w+"\s*:/, "a JSON text and no scene; its server may have answered with an error"],
   [/^version https:\/\/git-lfs/, "only a pointer to the file in Git LFS; fetch the file itself by git lfs pull"],
   [/^\xff\xd8\xff/, "a JPEG picture and no scene"],

@@ -14,7 +14,7 @@ const UNITS_PER_CELL = 8; // hidden units that the shaders process together
 const MIN_NORMAL_HALF_BITS = 0x38800000; // 2^-14
 const HALF_EXPONENT_OFFSET = 0x38000000, HALF_ROUNDING = 0x1000;
 
-const countRows = (count) => Math.max(1, Math.ceil(count / TEXTURE_WIDTH));
+const countRows = (count, width = TEXTURE_WIDTH) => Math.max(1, Math.ceil(count / width));
 
 const unorm16 = (value) => Math.round(65535 * Math.min(1, Math.max(0, value)));
 const snorm16 = (value) => Math.round(32767 * Math.min(1, Math.max(-1, value))) & 0xffff;
@@ -38,9 +38,7 @@ function packShapes({ count, positions, scales, quats, opacities }) {
   const floats = new Uint32Array(positions.buffer, positions.byteOffset, 3 * count);
   const places = new Uint32Array(4 * capacity), shapes = new Uint32Array(4 * capacity);
   for (let i = 0, p = 0, q = 0; i < count; i++, p += 3, q += 4) {
-    places[q] = floats[p];
-    places[q + 1] = floats[p + 1];
-    places[q + 2] = floats[p + 2];
+    for (let k = 0; k < 3; k++) places[q + k] = floats[p + k];
     places[q + 3] = pair16(unorm16(opacities[i]), quantizeScale(scales[p + 2]));
     shapes[q] = pair16(snorm16(quats[q]), snorm16(quats[q + 1]));
     shapes[q + 1] = pair16(snorm16(quats[q + 2]), snorm16(quats[q + 3]));
@@ -98,17 +96,17 @@ function packResiduals({ count, shapeResiduals, colorResiduals }, width) {
 
 // Packs what the Gaussians of a model share.
 export function packFields(model) {
-  const { metadata, config, geometry, radiance } = model;
-  const field = (which, { table, decoder }) => ({
-    table,
+  const { metadata, config } = model;
+  const field = (which) => ({
+    table: model[which].table,
     levels: gridLevels(config[which]).map((level) => [level.resolution, level.first, level.rows, Number(level.dense)]),
-    decoder: packDecoder(decoder, decoderLayout(config, which)),
+    decoder: packDecoder(model[which].decoder, decoderLayout(config, which)),
   });
   return {
     coarseBackground: backgroundPicture(model, COARSE_BACKGROUND_HEIGHT_PIXELS),
     backgroundSpacing: backgroundSpacing(metadata),
-    geometry: field("geometry", geometry),
-    radiance: field("radiance", radiance),
+    geometry: field("geometry"),
+    radiance: field("radiance"),
     cells: Math.ceil(config.hidden / UNITS_PER_CELL),
     sh: config.direction_encoding === "sh",
     halfExtent: config.frame.half_extent,
@@ -124,18 +122,15 @@ export function packFields(model) {
 // Packs the Gaussians of a model for textures that are `width` wide.
 export function packGaussians(model, width) {
   const { metadata, count, positions, colorLogits, scaleLogits, opacityLogits } = model;
-  const texels = width * Math.max(1, Math.ceil(count / width));
+  const texels = width * countRows(count, width), sizes = new Float32Array(texels);
   const explicit = new Float32Array(4 * texels), logits = new Float32Array(4 * texels);
-  const sizes = new Float32Array(texels);
   sizes.set(pixelSizes(positions, metadata));
   for (let i = 0, p = 0, q = 0; i < count; i++, p += 3, q += 4) {
-    explicit[q] = positions[p];
-    explicit[q + 1] = positions[p + 1];
-    explicit[q + 2] = positions[p + 2];
+    for (let k = 0; k < 3; k++) {
+      explicit[q + k] = positions[p + k];
+      logits[q + k] = colorLogits[p + k];
+    }
     explicit[q + 3] = opacityLogits[i];
-    logits[q] = colorLogits[p];
-    logits[q + 1] = colorLogits[p + 1];
-    logits[q + 2] = colorLogits[p + 2];
     logits[q + 3] = scaleLogits[i];
   }
   const balls = rowBalls(positions, width);
@@ -145,7 +140,7 @@ export function packGaussians(model, width) {
 // Arranges numbers, `columns` for each Gaussian, for a texture array that is `width` wide and has three of them in each
 // layer.
 function layerNumbers(numbers, count, columns, width) {
-  const texels = width * Math.max(1, Math.ceil(count / width));
+  const texels = width * countRows(count, width);
   const layered = new Float32Array(4 * texels * Math.ceil(columns / 3));
   for (let i = 0, at = 0; i < count; i++) {
     for (let k = 0; k < columns; k++) layered[4 * (texels * Math.floor(k / 3) + i) + (k % 3)] = numbers[at++];
@@ -159,10 +154,10 @@ export function joinPositions(parts) {
   const heights = parts.map((positions) => countRows(positions.length / 3));
   const joined = new Float32Array(3 * TEXTURE_WIDTH * heights.reduce((sum, height) => sum + height, 0)).fill(NaN);
   let row = 0;
-  for (const [number, positions] of parts.entries()) {
+  parts.forEach((positions, number) => {
     joined.set(positions, 3 * TEXTURE_WIDTH * row);
     row += heights[number];
-  }
+  });
   return joined;
 }
 
