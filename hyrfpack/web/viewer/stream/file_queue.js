@@ -9,6 +9,7 @@ const FIRST_RETRY_MS = 500, MAX_RETRY_MS = 8000;
 const STALL_MS = 15000; // a request that brings nothing for this time counts as lost
 const MAX_ATTEMPTS = 4; // for a file that is refused for now, ends early or comes damaged
 const MAX_BREAKS = 20; // of the connection within a file
+const MAX_PARTIALS = 32; // beginnings of files that are no longer wanted, in case they are again
 const TEMPORARY_STATUSES = [408, 425, 429, 500, 502, 503, 504];
 
 // A file cannot be used. The message says why, as the end of a sentence.
@@ -46,6 +47,8 @@ export class FileQueue {
       this.requests.delete(name);
       aborter.abort();
     }
+    const oldPartials = [...this.partials.keys()].filter((name) => !names.has(name)); // the oldest ones first
+    for (const name of oldPartials.slice(0, -MAX_PARTIALS)) this.partials.delete(name);
     this.start();
   }
 
@@ -126,6 +129,7 @@ export class FileQueue {
         if (partial.length > size) refuse(`it is longer than the ${groupedDigits(size)} bytes that the manifest says`);
       });
     } catch (error) {
+      aborter.abort(); // the rest of an answer that is refused
       if (partial.isEncoded) forget(partial); // a range would be one of the compressed bytes
       const isBroken = !(error instanceof UnusableFileError || error instanceof RetryError);
       if (isBroken && partial.length && ++partial.breaks > MAX_BREAKS) refuse("its connection breaks again and again");

@@ -64,6 +64,7 @@ export class SceneStream {
     this.problems = new Map(); // name of an unusable file -> the reason
     this.isOpening = false; // whether the content is being prepared
     this.isShown = false; // whether it was sent
+    this.isClosed = false; // whether nothing more is fetched
     this.early = new Map(); // name of a file that came before the shared file of its part -> [file, bytes]
     this.isOutdated = true; // whether levels must be chosen again
     this.isShort = false; // whether a wanted level does not fit into memory
@@ -140,6 +141,7 @@ export class SceneStream {
   }
 
   close() {
+    this.isClosed = true;
     this.queue?.close();
     clearTimeout(this.timer);
     self.removeEventListener("online", this.resume);
@@ -147,6 +149,7 @@ export class SceneStream {
 
   // Updates soon. Choosing levels of many chunks takes long, so it leaves time for sorting.
   schedule() {
+    if (this.isClosed) return;
     this.timer ??= setTimeout(() => this.update(), Math.max(MIN_UPDATE_MS, 2 * this.updateMs));
   }
 

@@ -1,0 +1,48 @@
+// Streams a scene of copies of a chunk and closes the stream while chunks are decoded: `node closed_stream.mjs FOLDER`.
+//
+// Prints, as JSON, `late`: the number of requests for files after that; `refused`: for an answer that is longer than the
+// manifest says, and for one of a missing file, whether its request is cancelled; and `partials`: the number of files
+// whose beginnings are kept after the requests for 100 files were cancelled one after the other.
+
+import { setTimeout as wait } from "node:timers/promises";
+
+import { copyManifest, requests, streamScene } from "./copied_scene.mjs";
+import { FileQueue } from "../../hyrfpack/web/viewer/stream/file_queue.js";
+
+const QUIET_MS = 500;
+let requested = null;
+const stream = streamScene(copyManifest(process.argv[2], 700, () => ({})), 1e6, ({ chunk }) => {
+  if (!chunk || requested !== null) return;
+  stream.handle({ close: true });
+  requested = requests;
+});
+while (requested === null) await wait(20);
+await wait(QUIET_MS);
+const late = requests - requested;
+
+const file = { file: "a.hyrf", bytes: 10, crc32: "00000000" };
+const refused = [];
+for (const [length, status] of [[11, 200], [0, 404]]) {
+  const queue = new FileQueue("http://host/", {
+    received: () => {}, failed: () => {}, changed: () => {},
+    send: async (_, { signal }) => {
+      const start = (controller) => controller.enqueue(new Uint8Array(length || 1)); // and it never ends
+      signal.addEventListener("abort", () => refused.push(status));
+      return new Response(new ReadableStream({ start }), { status });
+    },
+  });
+  queue.want([file]);
+  await wait(20);
+}
+
+const queue = new FileQueue("http://host/", {
+  received: () => {}, failed: () => {}, changed: () => {},
+  send: async () => new Response(new ReadableStream({ start: (controller) => controller.enqueue(new Uint8Array(1)) })),
+});
+for (let number = 0; number < 100; number++) {
+  queue.want([{ ...file, file: `${number}.hyrf` }]);
+  await wait(1);
+}
+queue.close();
+console.log(JSON.stringify({ late, refused, partials: queue.partials.size }));
+process.exit();
