@@ -56,13 +56,14 @@ def encode_player(
         stages: initial cameras for files, by the file's address relative to the page; see `html.encode_stage`.
         updates: address of a JSON file that says which snapshot of a training `content` is: {"snapshot": number from 1,
             0 while there is none, "step", "steps", "kind" of the run (see `Trainer`)}. The page requests it repeatedly
-            and shows newer snapshots from the viewer's current viewpoint. None for a file that does not change.
+            and shows newer snapshots from the viewer's current viewpoint; an `editable` page shows only the first one.
+            None for a file that does not change.
         gallery: address, relative to the page, of the list of scenes that a button leads back to; None for no button.
         in_folder: use the scripts and the style of `encode_player_files`, which must be beside the page, so that the
             page runs on servers whose content security policy is `default-src 'self'`.
         credit: text below the title, such as the author and the licence.
         editable: include the panel that edits a scene; with `in_folder`, use `encode_player_files(editable=True)`.
-        file: name or path of the file in the commands of that panel; None for the title.
+        file: name or path of the file in the commands of that panel; None for that of `content`.
 
     Returns:
         The file, UTF-8. The same arguments give the same bytes.

@@ -62,6 +62,18 @@ def test_changed_attributes_are_followed_without_a_new_viewer(browser: Browser, 
     wait_until(browser, "fired.some(([name, detail]) => name === 'error' && detail.startsWith('The exposure must be'))")
 
 
+def test_an_invalid_exposure_does_not_prevent_the_load_of_another_scene(browser: Browser, host: Site):
+    open_element(browser, host)
+    wait_until(browser, LOADED_JS)
+    browser.evaluate(
+        f"fired.length = 0, {ELEMENT_JS}.setAttribute('exposure', 'dark'),"
+        f"{ELEMENT_JS}.setAttribute('src', 'some scene.hyrf')"
+    )
+    wait_until(browser, LOADED_JS)
+    assert browser.evaluate(f"{ELEMENT_JS}.viewer.scene.kind") == "hyrf"
+    assert browser.evaluate("fired.some(([name, detail]) => name === 'error' && /exposure/.test(detail))")
+
+
 def test_the_first_camera_is_that_of_the_attribute(browser: Browser, host: Site):
     open_element(browser, host, "src='some scene.hyrf'")
     wait_until(browser, LOADED_JS)

@@ -434,6 +434,13 @@ def test_a_saved_picture_equals_the_window(browser: Browser, tmp_path: Path):
 ONE_PIXEL_POSTER = base64.b64decode(b"UklGRh4AAABXRUJQVlA4TBEAAAAvAAAAAAdQ//73v/+BiOh/AAA=")  # one pixel
 
 
+def test_a_picture_that_cannot_be_made_is_reported(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+    browser.evaluate("void (hyrfpack.player.canvas.toBlob = (done) => done(null))")
+    browser.press("c")
+    assert wait_for_message(browser) == "The picture is too large for this browser; try again in a smaller window."
+
+
 def test_a_picture_saved_while_others_are_drawn_has_the_order_of_its_own_view(browser: Browser, tmp_path: Path):
     open_page(browser, tmp_path, make_splats_page(random_splats()))
     home = wait_until_still(browser).evaluate("hyrfpack.player.capture().then((blob) => blob.text())")

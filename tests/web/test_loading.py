@@ -11,8 +11,29 @@ from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
 
 
 @pytest.fixture(scope="module")
+def loading() -> dict:
+    return run_script(Path(__file__).with_name("loading.mjs"))
+
+
+@pytest.fixture(scope="module")
 def closed_stream() -> dict:
     return run_script(Path(__file__).with_name("closed_stream.mjs"), GOLDEN_SCENE_FOLDER)
+
+
+def test_a_loader_that_waits_for_a_manifest_rejects_when_it_is_disposed_of(loading: dict):
+    assert loading["loaderError"] == "SupersededError"
+
+
+def test_a_folder_whose_name_has_a_bare_percent_sign_names_its_scene(loading: dict):
+    assert loading["folderName"] == "50%"
+
+
+def test_answers_that_nobody_reads_are_cancelled(loading: dict):
+    assert loading["cancelled"] == [True, True]
+
+
+def test_a_pointer_that_was_pressed_elsewhere_shows_no_hint(loading: dict):
+    assert loading["lifted"] == []
 
 
 def test_a_closed_stream_requests_nothing_more(closed_stream: dict):

@@ -163,6 +163,28 @@ def test_a_damaged_file_is_reported_and_the_scene_stays(browser: Browser, host: 
     wait_until(browser, "document.getElementById('sentence').textContent.startsWith('empty.ply cannot be opened: ')")
 
 
+HOLD_FETCHES_JS = (
+    "(() => { const real = fetch; const held = new Promise((done) => { window.release = done; });"
+    " window.fetch = async (...request) => { const answer = await real(...request), bytes = await answer.arrayBuffer();"
+    " const start = async (controller) => {"
+    "   await held; controller.enqueue(new Uint8Array(bytes)); controller.close(); };"
+    " return new Response(new ReadableStream({ start })); }; })()"
+)
+
+
+def test_a_damaged_file_that_is_dropped_early_does_not_rename_the_scene(browser: Browser, host: Site):
+    host.files["/index.html"] = encode_player("a title", content="some scene.hyrf", credit="Photos: A. B.")
+    with browser.before_every_page(HOLD_FETCHES_JS):
+        browser.open(f"{host.address}/index.html")
+        wait_until(browser, "window.hyrfpack?.player.next")
+        drop_file(browser, b"no scene", "bad.hyrf")
+        wait_until(browser, "document.getElementById('sentence').textContent.startsWith('bad.hyrf cannot be opened: ')")
+        browser.evaluate("release()")
+        wait_until(browser, LOADED_COUNT_JS)
+    assert browser.evaluate("document.title") == "a title"
+    assert browser.evaluate("document.getElementById('credit').checkVisibility()")
+
+
 def test_a_page_with_a_scene_inside_opens_dropped_files(browser: Browser, tmp_path: Path):
     open_page(browser, tmp_path, make_splats_page(random_splats(50)))
     drop_file(browser, GOLDEN_FILE_DATA, "model.hyrf")

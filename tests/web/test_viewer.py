@@ -174,6 +174,55 @@ def test_a_load_that_is_replaced_rejects_with_an_abort_error_and_fires_nothing(b
     assert browser.evaluate("[viewer.scene.count, errors]") == [300, []]
 
 
+def test_a_scene_that_still_loads_is_not_shown_when_the_next_one_is_missing(browser: Browser, site: Site):
+    open_viewer(
+        browser,
+        site,
+        "window.viewer = createViewer({ container: '#box' }); const source = new ReadableStream({"
+        " start: (controller) => { window.controller = controller; } });"
+        "window.first = viewer.load(source).then(() => 'shown', ({ name }) => name);"
+        "window.bytes = new Uint8Array(await (await fetch('some scene.hyrf')).arrayBuffer());",
+    )
+    browser.evaluate("controller.enqueue(bytes.slice(0, 500)), new Promise((done) => setTimeout(done, 50))")
+    assert "404" in error_of(browser, "viewer.load('gone.hyrf')")
+    assert browser.evaluate("Promise.race([first, new Promise((done) => setTimeout(done, 2000))])") == "AbortError"
+    browser.evaluate("viewer.load('cloud.spz')")
+    assert browser.evaluate("[viewer.isReady, viewer.scene.count]") == [True, 300]
+
+
+def test_a_scene_of_which_a_part_is_shown_becomes_ready_when_the_next_one_is_missing(browser: Browser, site: Site):
+    open_viewer(
+        browser,
+        site,
+        "window.viewer = createViewer({ container: '#box' }); window.fired = 0;"
+        "viewer.on('ready', () => { window.fired++; });"
+        "window.bytes = new Uint8Array(await (await fetch('some scene.hyrf')).arrayBuffer());"
+        "window.first = viewer.load(bytes);",
+    )
+    # While the scene is shown, its loader has not ended.
+    browser.evaluate(
+        "(async () => { const { player } = viewer, open = player.open.bind(player); await first; window.fired = 0;"
+        " player.open = (file) => open(file).then(() => new Promise((done) => { window.end = done; }));"
+        " window.second = viewer.load(bytes).then(() => 'shown', ({ name }) => name); })()"
+    )
+    wait_until(browser, "Boolean(window.end)")
+    assert "404" in error_of(browser, "viewer.load('gone.hyrf')")
+    browser.evaluate("end(), second")
+    assert browser.evaluate("[viewer.isReady, window.fired]") == [True, 1]
+
+
+def test_a_screenshot_is_completed_out_of_the_window(browser: Browser, site: Site):
+    open_viewer(browser, site)
+    wait_until(browser, READY_JS)
+    browser.evaluate(
+        "Object.defineProperty(viewer.player, 'settled', { get: () => new Promise((done) => { window.go = done; }) }),"
+        "window.picture = viewer.screenshot(), viewer.watch(false)"
+    )
+    assert not browser.evaluate("viewer.player.paused")
+    assert browser.evaluate("go(), picture.then(({ type }) => type)") == "image/png"
+    assert browser.evaluate("viewer.player.paused")
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -195,7 +244,7 @@ def test_an_invalid_camera_is_refused(browser: Browser, site: Site):
     assert "has no scene yet" in error_of(browser, "viewer.moveTo(0)")
     wait_until(browser, READY_JS)
     assert "There is no camera 99" in error_of(browser, "viewer.moveTo(99)")
-    assert "there is no camera 99" in error_of(browser, "viewer.moveTo('99')")
+    assert error_of(browser, "viewer.moveTo('99')").startswith("The camera 99 cannot be used: there is no camera 99")
     assert "camera_from_world" in error_of(browser, "viewer.moveTo({ width: 3 })")
 
 

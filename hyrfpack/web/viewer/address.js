@@ -74,20 +74,16 @@ export function parseHash(hash) {
 }
 
 // Parses the text of a camera. Returns {number}, an index into the scene's cameras, or {view, depth}: another camera
-// and, if the text has it, the depth of the point to orbit about. Throws an Error with a message for the user.
+// and, if the text has it, the depth of the point to orbit about. Throws an Error whose message is the reason.
 export function parseCamera(text, scene) {
-  try {
-    text = decodeURIComponent(text).trim();
-    if (/^\d{1,6}$/.test(text)) {
-      const count = scene.cameras.length;
-      if (text < 1 || text > count) throw new Error(`there is no camera ${text}, only ${count}`);
-      return { number: text - 1 };
-    }
-    if (text.startsWith("{")) return { view: viewOf(JSON.parse(text), scene) };
-    return parseCompactCamera(text, scene);
-  } catch ({ message }) {
-    throw new Error(`The camera in the address cannot be used: ${message}.`);
+  text = decodeURIComponent(text).trim();
+  if (/^\d{1,6}$/.test(text)) {
+    const count = scene.cameras.length;
+    if (text < 1 || text > count) throw new Error(`there is no camera ${text}, only ${count}`);
+    return { number: text - 1 };
   }
+  if (text.startsWith("{")) return { view: viewOf(JSON.parse(text), scene) };
+  return parseCompactCamera(text, scene);
 }
 
 // Formats the eye as nine numbers for a link: position (world units), rotation (camera from world: w, x, y, z), focal

@@ -137,7 +137,7 @@ export class Controls {
   }
 
   lift(event) {
-    this.pointers.delete(event.pointerId);
+    if (!this.pointers.delete(event.pointerId)) return; // it was pressed elsewhere
     const [x, y] = this.placeOf(event), { timeStamp: time } = event;
     const near = (to, pixels, ms) => to && Math.hypot(x - to.x, y - to.y) < pixels && time - to.time < ms;
     const maxTapMs = this.pick ? Infinity : MAX_TAP_MS; // a pick may take time to aim
@@ -146,7 +146,7 @@ export class Controls {
     this.acted();
     if (!tap) {
       this.tapped = null;
-      if (!this.engaged) this.ignored("finger");
+      if (!this.engaged && event.pointerType !== "mouse") this.ignored("finger");
     } else if (this.pick) {
       this.pick(x, y);
     } else if (near(this.tapped, MAX_DOUBLE_TAP_DISTANCE_PIXELS, MAX_TAP_MS)) {

@@ -92,22 +92,31 @@ export class InlineView {
       this.isEager = now.loading !== "lazy";
       return assignScenes();
     }
+    const isNew = (name) => now[name] !== before[name];
+    if (isNew("title")) this.viewer.canvas.setAttribute("aria-label", now.title ?? "3D scene");
+    if (isNew("autorotate")) this.viewer.autorotate = now.autorotate !== null && !prefersReducedMotion();
+    if (isNew("src")) {
+      this.viewer.firstCamera = now.camera;
+      this.viewer.load(now.src).catch(() => {}); // the event has reported it
+    } else if (isNew("camera")) {
+      this.attempt(() => this.moveTo(now.camera));
+    }
+    if (isNew("exposure")) this.attempt(() => (this.viewer.exposure = now.exposure ?? AS_PHOTOGRAPHED));
+  }
+
+  // Does what an attribute asks for, and shows the error if its value is invalid.
+  attempt(follow) {
     try {
-      if (now.title !== before.title) this.viewer.canvas.setAttribute("aria-label", now.title ?? "3D scene");
-      if (now.exposure !== before.exposure) this.viewer.exposure = now.exposure ?? AS_PHOTOGRAPHED;
-      if (now.autorotate !== before.autorotate) {
-        this.viewer.autorotate = now.autorotate !== null && !prefersReducedMotion();
-      }
-      if (now.src !== before.src) {
-        this.viewer.firstCamera = now.camera;
-        this.viewer.load(now.src).catch(() => {}); // the event has reported it
-      } else if (now.camera !== before.camera) {
-        if (!this.viewer.scene) this.viewer.firstCamera = now.camera;
-        else if (now.camera !== null) this.viewer.moveTo(now.camera);
-      }
+      follow();
     } catch (error) {
       this.fail(error);
     }
+  }
+
+  // Moves the eye to the camera of the attribute, or begins there if there is no scene yet.
+  moveTo(camera) {
+    if (!this.viewer.scene) this.viewer.firstCamera = camera;
+    else if (camera !== null) this.viewer.moveTo(camera);
   }
 
   create({ src, camera, title, exposure, autorotate, interaction, loading, worker }) {

@@ -2,5 +2,6 @@
 
 import { startPage } from "./page.js";
 import { STREAMING } from "./stream/stream_loader.js";
+import { watchTraining } from "./training.js";
 
-startPage({ streaming: STREAMING });
+startPage({ streaming: STREAMING, watchTraining });

@@ -5,8 +5,10 @@ import { element } from "./dom.js";
 const TOAST_MS = 4000;
 let toastTimer = 0;
 
-// Shows the sentence of an error until it is dismissed.
+// Shows the sentence of an error until it is dismissed. One without a sentence, such as a question to a loader whose
+// scene was replaced meanwhile, is not for the user.
 export function fail({ message }) {
+  if (!message) return;
   element("loading").hidden = true;
   element("sentence").textContent = message;
   element("message").hidden = false;

@@ -1,15 +1,10 @@
-// Opens scenes in the player: the page's own, that of its address, a file that the user chose, and a training's
-// snapshots.
+// Opens scenes in the player: the page's own, that of its address, and a file that the user chose.
 
 import { resolveAddress } from "./address.js";
 import { element } from "./dom.js";
-import { dismiss, fail, progress, remark } from "./notifications.js";
+import { dismiss, fail, progress } from "./notifications.js";
 import { readPayload } from "./payload.js";
 import { chosenFile, fetchedFile } from "./source.js";
-import { followTraining, trainingTitle } from "./training.js";
-
-const NOT_STARTED_TEXT = "The training has not taken its first step yet.";
-const TRAINING_ENDED_TEXT = "The training does not answer any more; this is its last snapshot.";
 
 // Reports a load or an error to the page around this one, where <hyrf-viewer> handles it.
 export const postToParent = (hyrf, message = "") => {
@@ -31,11 +26,12 @@ export function findFirstFile(served, parameters) {
 }
 
 export class Opener {
-  // `title` is that of the scene in the page.
-  constructor(player, panel, title) {
-    Object.assign(this, { player, panel });
-    // `isOwn` is true if the page or its address names the scene, and not the user.
-    this.shown = this.loading = { title, isOwn: true };
+  // `title` is that of the scene in the page. `watchTraining` is that of training.js, null in pages that follow none.
+  constructor(player, panel, { title, watchTraining = null }) {
+    Object.assign(this, { player, panel, watchTraining });
+    // What is known of the scene that is shown: its title, and whether the page or its address names it, and not the
+    // user. If it was opened, also the `name` of its file, and whether the page or its address names the title.
+    this.shown = { title, isOwn: true };
     this.openCount = 0; // identifies the scene that was opened last
     this.invites = false; // whether nothing names a scene, so that the page asks for one
   }
@@ -49,8 +45,9 @@ export class Opener {
       return;
     }
     const { address, stage } = findFirstFile(served, parameters);
-    const updates = parameters.content || !served?.updates ? null : resolveAddress(served.updates, "content");
-    if (updates) return this.watchTraining(address, updates, served.title);
+    const isTraining = this.watchTraining && !parameters.content && served?.updates;
+    const updates = isTraining ? resolveAddress(served.updates, "content") : null;
+    if (updates) return this.watchTraining(this, address, updates, served.title);
     if (address) {
       const name = parameters.title ?? (parameters.content ? null : served.title);
       return this.open(async () => ({ ...(await fetchedFile(address)), stage }), name);
@@ -79,41 +76,14 @@ export class Opener {
     try {
       progress(0);
       const file = await fetchFile();
-      if (thisOpen !== this.openCount) return;
-      this.loading = { title: name ?? file.name.replace(/\.\w+$/, ""), isNamed: name !== null, isOwn };
-      await this.player.open(file);
+      if (thisOpen !== this.openCount) return file.stream.cancel?.();
+      const title = name ?? file.name.replace(/\.\w+$/, "");
+      await this.player.open({ ...file, origin: { title, isNamed: name !== null, isOwn, name: file.name } });
       postToParent("load");
     } catch (error) {
       if (thisOpen !== this.openCount) return; // another scene was opened meanwhile
       this.invite();
       throw error;
     }
-  }
-
-  // Shows a model that is being trained. Newer snapshots replace it without moving the eye.
-  watchTraining(address, updates, sceneTitle) {
-    return new Promise((shown, failed) => {
-      let thisOpen = this.openCount, isShown = false; // changes when the user opens a file
-      const isWanted = () => thisOpen === this.openCount;
-      const show = async (training) => {
-        const title = trainingTitle(sceneTitle, training);
-        if (!isShown) {
-          remark("");
-          const opening = this.open(() => fetchedFile(address), title);
-          thisOpen = this.openCount;
-          await opening;
-          isShown = true;
-          return shown();
-        }
-        const file = await fetchedFile(address);
-        if (!isWanted()) return;
-        await this.player.open({ ...file, update: true });
-        if (!isWanted()) return;
-        this.shown = this.loading = { ...this.shown, title };
-        this.panel.setTitle(this.player.scene, title);
-      };
-      const ended = followTraining(updates, { show, waiting: () => remark(NOT_STARTED_TEXT), isWanted });
-      ended.then(() => isWanted() && remark(TRAINING_ENDED_TEXT), failed);
-    });
   }
 }

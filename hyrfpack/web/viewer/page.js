@@ -71,7 +71,7 @@ function showPage() {
   postToParent("start");
 }
 
-function start({ startEditing = () => {}, streaming = null }) {
+function start({ startEditing = () => {}, streaming = null, watchTraining }) {
   showPage();
   // In a folder, hyrfpack.web.player writes the constant EMBEDDED_TEXTS in front of this script.
   const isInFolder = typeof EMBEDDED_TEXTS !== "undefined";
@@ -103,8 +103,8 @@ function start({ startEditing = () => {}, streaming = null }) {
     try {
       navigation.moveTo(parseCamera(text, player.scene), smoothly ? undefined : 0);
       if (smoothly) dismiss();
-    } catch (error) {
-      fail(error);
+    } catch ({ message }) {
+      fail({ message: `The camera in the address cannot be used: ${message}.` });
     }
   };
 
@@ -152,8 +152,11 @@ function start({ startEditing = () => {}, streaming = null }) {
       panel.toggleSettings(false);
     },
   });
-  const opener = new Opener(player, panel, embedded ? (parameters.title ?? embedded.title) : document.title);
-  const editor = startEditing({ player, navigation, panel, opener, file: (embedded ?? served)?.file ?? null });
+  const title = embedded ? (parameters.title ?? embedded.title) : document.title;
+  const opener = new Opener(player, panel, { title, watchTraining });
+  const { isOwn, stage } = findFirstFile(served, parameters), isCredited = embedded || isOwn || stage;
+  const { file } = embedded ?? (isOwn && served) ?? {};
+  const editor = startEditing({ player, navigation, panel, opener, file });
   if (parameters.exposure) player.exposure = parameters.exposure;
 
   // ---- events of the player
@@ -166,7 +169,7 @@ function start({ startEditing = () => {}, streaming = null }) {
   });
   player.addEventListener("opened", ({ detail }) => {
     navigation.stop();
-    opener.shown = opener.loading;
+    opener.shown = player.loader.origin;
     if (detail.isStreamed && !opener.shown.isNamed) opener.shown.title = detail.title; // the manifest has it
     panel.describe(detail, opener.shown.title);
     element("credit").hidden = !(opener.shown.isOwn && isCredited);
@@ -212,14 +215,13 @@ function start({ startEditing = () => {}, streaming = null }) {
     panel.describe(embedded, opener.shown.title);
     followNamedCamera();
   }
-  const { isOwn, stage } = findFirstFile(served, parameters), isCredited = Boolean(isOwn || stage);
-  element("credit").hidden = !embedded && !isCredited;
+  element("credit").hidden = !isCredited;
   const ready = opener.openFirst(Boolean(embedded), served, parameters);
   ready.catch((error) => {
     fail(error);
     postToParent("error", error.message);
   });
-  if (parameters.wrong.length) fail(new Error(parameters.wrong.join(" ")));
+  if (parameters.wrong.length) fail({ message: parameters.wrong.join(" ") });
 
   // The interface for scripts. Cameras are {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4}, with OpenCV axes;
   // poses are in world units, the rest in pixels.
@@ -239,7 +241,7 @@ function start({ startEditing = () => {}, streaming = null }) {
 }
 
 // Starts the page. `startEditing(parts)` is called with its player, navigation, panel, opener, and the name of its file
-// if the page states it, and returns the editor. `streaming` is for Player.
+// if the page states it, and returns the editor. `streaming` is for Player, and `watchTraining` for Opener.
 export function startPage(options = {}) {
   try {
     start(options);

@@ -2,6 +2,7 @@
 
 import { AS_PHOTOGRAPHED } from "./exposure.js";
 import { element } from "./dom.js";
+import { fail } from "./notifications.js";
 import { Strip } from "./strip.js";
 
 const LARGE_WINDOW_QUERY = "(min-width: 900px) and (min-height: 600px)"; // the strip of cameras covers little of it
@@ -64,10 +65,10 @@ export class Panel {
     element("exposure").setAttribute("aria-pressed", String(exposure === AS_PHOTOGRAPHED));
   }
 
-  // Performs the action of a key.
+  // Performs the action of a key, and shows its error if it fails.
   press(key) {
     if (/^[1-9]$/.test(key)) this.actions.choose(Number(key) - 1);
-    else this.actions[key]?.();
+    else this.actions[key]?.()?.catch?.(fail);
   }
 
   // Shows or hides the title, the toolbar and what belongs to it.

@@ -35,6 +35,7 @@ const COLORING_RATIO = 0.25; // the share of a frame that is used for colours wh
 const PROGRESS_RANGES = { loading: [0, 0.3], unpacking: [0.3, 0.6], preparing: [0.6, 1] };
 
 const DEVICE_LOST_TEXT = "Meanwhile the graphics device was lost, or another scene opened; try again.";
+const NO_PICTURE_TEXT = "The picture is too large for this browser; try again in a smaller window.";
 const NOT_READY_TEXT = "The scene is not ready for exact pictures yet; wait until it is loaded.";
 const DISPOSED_TEXT = "The player was disposed of.";
 const NO_ORDER = { order: null, drawn: 0 }; // of contents that sort themselves
@@ -137,18 +138,20 @@ export class Player extends EventTarget {
 
   // Opens a file, {name, stream, address}; `address` is needed for manifests of scene folders. `stage` has its
   // {cameras, up, target} if they are known. `update` is true for a newer version of the scene that is shown: then the
-  // eye stays, and only errors are reported.
-  async open({ name, stream, address = null, stage = null, update = false }) {
+  // eye stays, and only errors are reported. `origin` is what the page knows of the file; its loader keeps it.
+  async open(file) {
     try {
-      await this.receive({ name, stream, address, stage, picture: null, update });
+      await this.receive(file);
     } catch (error) {
       const isForUser = error instanceof StartError || error instanceof SupersededError;
-      throw isForUser ? error : new Error(`${name} cannot be opened: ${error.message}`);
+      throw isForUser ? error : new Error(`${file.name} cannot be opened: ${error.message}`);
     }
   }
 
   // Loads a file and shows it.
-  async receive({ name = "", scene = null, stage = null, stream, address = null, picture, update = false }) {
+  async receive({
+    name = "", scene = null, stage = null, stream, address = null, picture = null, update = false, origin = null,
+  }) {
     // The page's own file is kept, and shown if this one fails.
     if (this.loader || this.previous) this.next?.dispose();
     else this.previous = this.next;
@@ -159,7 +162,7 @@ export class Player extends EventTarget {
       workerAddress: this.workerAddress,
       player: this,
     });
-    Object.assign(loader, { picture, part: 0, scene, remark: "", update });
+    Object.assign(loader, { picture, part: 0, scene, remark: "", update, origin });
     this.next = loader;
     this.failure = null;
     try {
@@ -653,7 +656,9 @@ export class Player extends EventTarget {
     await this.sortFor(view); // the last order may be that of a picture of `preview` or `show`
     this.renderer.draw(view, this.resolution, this.exposureOf(view));
     this.present();
-    return new Promise((resolve) => this.canvas.toBlob(resolve, type, quality));
+    const picture = await new Promise((resolve) => this.canvas.toBlob(resolve, type, quality));
+    if (!picture) throw new Error(NO_PICTURE_TEXT);
+    return picture;
   }
 
   // Sorts a content for a view, for a picture that is drawn at once. Throws ContextLostError if that is impossible.
@@ -682,8 +687,8 @@ export class Player extends EventTarget {
     return pictures.length === views.length ? pictures : null;
   }
 
-  // Moves the eye to a camera in world units and draws its picture. Returns its RGB bytes, top row first. If that is
-  // impossible, throws an Error with a message for the user, and the eye does not move.
+  // Moves the eye to a camera in world units and draws its picture. Returns its RGB bytes, top row first. Throws an
+  // Error with a message for the user if that is impossible. An invalid camera does not move the eye.
   async show(camera) {
     if (!this.loaded) throw new Error(DEVICE_LOST_TEXT);
     const view = viewOf(camera, this.scene), { content } = this.renderer;

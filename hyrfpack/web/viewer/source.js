@@ -1,5 +1,6 @@
 // Reads a scene's bytes from an address, a file or memory, as {name, stream, address}; the stream is an async iterable
 // of Uint8Array, whose `length` is the number of bytes, or 0 if that is unknown. Only fetched files have an address.
+// Their streams have a method `cancel`, which ends the download of a file that is not read.
 
 const FROM_DISK_TEXT = "a page opened from the disk may not read files; drop the file on the page, or serve both";
 // A sandbox without allow-same-origin makes every server, even the page's own, another site.
@@ -39,12 +40,13 @@ export async function fetchedFile(address) {
   const name = nameOfAddress(address), answer = await request(address, name);
   if (!answer.ok) {
     const status = [answer.status, answer.statusText].filter(Boolean).join(" ");
-    await answer.body?.cancel();
+    discard(answer);
     throw new Error(`${name} could not be fetched (${status}); check the address ${address}`);
   }
   // For a compressed transfer, Content-Length is not the length of the file.
   const length = answer.headers.get("Content-Encoding") ? 0 : Number(answer.headers.get("Content-Length")) || 0;
-  const stream = Object.assign(downloaded(address, name, answer, length), { length });
+  const cancel = () => discard(answer);
+  const stream = Object.assign(downloaded(address, name, answer, length), { length, cancel });
   return { name, stream, address: answer.url || address };
 }
 
@@ -53,15 +55,17 @@ export function chosenFile(file) {
   return { name: file.name ?? UNNAMED_FILE, stream: Object.assign(pieces(file.stream()), { length: file.size }) };
 }
 
-// Returns the file name in an address.
-const nameOfAddress = (address) => {
-  const last = new URL(address).pathname.split("/").pop();
+// Decodes a name in an address. One whose percent signs are invalid stays as it is.
+export const decodeName = (name) => {
   try {
-    return decodeURIComponent(last) || "the file";
+    return decodeURIComponent(name);
   } catch {
-    return last;
+    return name;
   }
 };
+
+// Returns the file name in an address.
+const nameOfAddress = (address) => decodeName(new URL(address).pathname.split("/").pop()) || "the file";
 
 // Returns why a request got no answer.
 function noAnswerReason({ origin, host }) {
@@ -79,6 +83,9 @@ async function request(address, name, headers = {}) {
     throw new Error(`${name} could not be fetched: ${noAnswerReason(new URL(address))}.`);
   }
 }
+
+// Ends the download of an answer that nobody has begun to read.
+const discard = (answer) => answer.body?.cancel().catch(() => {});
 
 // Yields the bytes of an answer. After a broken connection, the rest is requested once, by a range request.
 async function* downloaded(address, name, answer, length) {
@@ -102,7 +109,10 @@ async function* downloaded(address, name, answer, length) {
       const headers = { Range: `bytes=${done}-`, ...condition };
       answer = await request(address, name, headers);
       const first = answer.headers.get("Content-Range");
-      if (answer.status !== 206 || (first && !first.startsWith(`bytes ${done}-`))) throw brokenError;
+      if (answer.status !== 206 || (first && !first.startsWith(`bytes ${done}-`))) {
+        discard(answer);
+        throw brokenError;
+      }
     }
   }
 }

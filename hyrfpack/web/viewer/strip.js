@@ -1,6 +1,7 @@
 // Shows the scene's cameras as a strip of small pictures, which the player draws once it has nothing else to do.
 
 import { element } from "./dom.js";
+import { fail } from "./notifications.js";
 
 const WIDTH_PIXELS = 96, HEIGHT_PIXELS = 72; // of a picture
 
@@ -39,7 +40,7 @@ export class Strip {
     this.strip.hidden = !isOpen;
     element("views").setAttribute("aria-expanded", String(isOpen));
     this.mark();
-    this.draw();
+    this.draw().catch(fail);
   }
 
   // Draws the pictures of the scene's cameras if they are visible and not drawn yet, while the eye stands still.

@@ -1,5 +1,11 @@
 // Follows a training run through its server, which has the progress and the newest snapshot of the model.
 
+import { remark } from "./notifications.js";
+import { fetchedFile } from "./source.js";
+
+const NOT_STARTED_TEXT = "The training has not taken its first step yet.";
+const TRAINING_ENDED_TEXT = "The training does not answer any more; this is its last snapshot.";
+
 const REQUEST_INTERVAL_MS = 2000;
 const WAIT_PER_LOAD_RATIO = 3; // the wait after a snapshot is at least this many times its loading time
 const MAX_FAILURES = 3; // after this many consecutive failed requests, the run counts as ended
@@ -19,7 +25,7 @@ async function requestProgress(address) {
 
 // Follows a training run until its server stops answering or `isWanted()` is false. `show(progress)` is called for each
 // new snapshot, and its promise is awaited; `waiting()` is called while there is no snapshot.
-export async function followTraining(address, { show, waiting, isWanted }) {
+async function followTraining(address, { show, waiting, isWanted }) {
   let shown = 0;
   for (let failures = 0; isWanted() && failures < MAX_FAILURES; ) {
     const progress = document.hidden && shown ? { snapshot: shown } : await requestProgress(address);
@@ -40,5 +46,33 @@ export async function followTraining(address, { show, waiting, isWanted }) {
   }
 }
 
-export const trainingTitle = (title, { step, steps, kind }) =>
+const trainingTitle = (title, { step, steps, kind }) =>
   `${title}, ${kind ? `${kind}, ` : ""}step ${step.toLocaleString("en")} of ${steps.toLocaleString("en")}`;
+
+// Shows a model that is being trained, by the Opener of a page. Newer snapshots replace it without moving the eye.
+export function watchTraining(opener, address, updates, sceneTitle) {
+  const { player, panel } = opener;
+  return new Promise((shown, failed) => {
+    let thisOpen = opener.openCount, isShown = false; // changes when the user opens a file
+    const isWanted = () => thisOpen === opener.openCount;
+    const show = async (training) => {
+      const title = trainingTitle(sceneTitle, training);
+      if (!isShown) {
+        remark("");
+        const opening = opener.open(() => fetchedFile(address), title);
+        thisOpen = opener.openCount;
+        await opening;
+        isShown = true;
+        return shown();
+      }
+      const file = await fetchedFile(address), origin = { ...opener.shown, title };
+      if (!isWanted()) return file.stream.cancel();
+      await player.open({ ...file, update: true, origin });
+      if (!isWanted()) return;
+      opener.shown = origin;
+      panel.setTitle(player.scene, title);
+    };
+    const ended = followTraining(updates, { show, waiting: () => remark(NOT_STARTED_TEXT), isWanted });
+    ended.then(() => isWanted() && remark(TRAINING_ENDED_TEXT), failed);
+  });
+}

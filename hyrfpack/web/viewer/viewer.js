@@ -52,7 +52,8 @@ class Viewer {
     this.listeners = new Map(EVENTS.map((event) => [event, new Set()]));
     this.firstCamera = camera; // for the first scene
     this.progress = 0;
-    this.lastLoad = 0; // the number of the last load
+    this.currentLoad = null; // identifies the load whose scene is wanted
+    this.screenshots = 0; // those that are being made
     this.isReady = false;
     this.readyLoader = null; // that of the last scene that was loaded completely
     this.isDestroyed = false;
@@ -131,30 +132,34 @@ class Viewer {
   }
 
   applyPause() {
-    if (this.isPaused || !this.isVisible) this.player.pause();
+    if ((this.isPaused || !this.isVisible) && !this.screenshots) this.player.pause();
     else this.player.resume();
   }
 
   async load(src, { name } = {}) {
     if (this.isDestroyed) throw new Error("The viewer has been destroyed; create another one.");
-    const thisLoad = ++this.lastLoad;
+    const { player, currentLoad: before } = this, thisLoad = Symbol(name);
+    const isDropped = () => this.currentLoad !== thisLoad;
+    this.currentLoad = thisLoad;
+    if (player.next) player.discard(player.next); // an earlier scene that is not shown yet
     this.pending = null;
     this.isReady = false;
     this.progress = 0;
     try {
       const file = await openSource(src, name);
-      if (thisLoad === this.lastLoad) await this.player.open(file);
+      if (isDropped()) file.stream.cancel?.();
+      else await player.open(file);
     } catch (error) {
-      if (thisLoad === this.lastLoad && !(error instanceof SupersededError)) {
-        this.isReady = this.readyLoader !== null && this.readyLoader === this.player.loader; // an earlier scene stays
-        if (this.isReady) this.progress = 1;
-        this.emit("error", { error });
-        throw error;
-      }
+      if (isDropped() || error instanceof SupersededError) throw newAbortError();
+      this.currentLoad = before; // an earlier scene stays, of which only a part may be loaded
+      this.isReady = this.readyLoader !== null && this.readyLoader === player.loader;
+      if (this.isReady) this.progress = 1;
+      this.emit("error", { error });
+      throw error;
     }
-    if (thisLoad !== this.lastLoad) throw new DOMException("Another scene was loaded instead.", "AbortError");
+    if (isDropped()) throw newAbortError();
     this.isReady = true;
-    this.readyLoader = this.player.loader;
+    this.readyLoader = player.loader;
     this.emit("ready", { scene: this.scene });
   }
 
@@ -209,11 +214,13 @@ class Viewer {
 
   async screenshot({ type = "image/png", quality } = {}) {
     if (!this.player.loaded) throw new Error("The viewer has no scene yet; wait for 'ready'.");
-    this.player.resume();
+    this.screenshots++;
+    this.applyPause();
     try {
       await this.player.settled;
       return await this.player.capture(type, quality);
     } finally {
+      this.screenshots--;
       this.applyPause();
     }
   }
@@ -231,7 +238,7 @@ class Viewer {
   destroy() {
     if (this.isDestroyed) return;
     this.isDestroyed = true;
-    this.lastLoad++;
+    this.currentLoad = null;
     this.pending = null;
     this.observer.disconnect();
     this.navigation.dispose();
@@ -241,6 +248,8 @@ class Viewer {
   }
 }
 
+const newAbortError = () => new DOMException("Another scene was loaded instead.", "AbortError");
+
 // Throws an Error if a value is not one of the allowed ones.
 function checkChoice(name, value, allowed) {
   if (!allowed.includes(value)) throw new Error(`${name} must be ${allowed.join(", ")}, not ${String(value)}.`);
@@ -248,7 +257,13 @@ function checkChoice(name, value, allowed) {
 
 // Returns {number} or {view, depth} of a camera: its index from 0, its text in a link, or a camera in world units.
 function readCamera(camera, scene) {
-  if (typeof camera === "string") return parseCamera(camera, scene);
+  if (typeof camera === "string") {
+    try {
+      return parseCamera(camera, scene);
+    } catch ({ message }) {
+      throw new Error(`The camera ${camera} cannot be used: ${message}.`);
+    }
+  }
   if (typeof camera !== "number") return { view: viewOf(camera, scene) };
   if (Number.isInteger(camera) && camera >= 0 && camera < scene.cameras.length) return { number: camera };
   throw new Error(`There is no camera ${camera}; the scene has cameras 0 to ${scene.cameras.length - 1}.`);

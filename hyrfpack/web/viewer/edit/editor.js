@@ -13,8 +13,8 @@ import { SaveTool } from "./save_tool.js";
 import { UpTool } from "./up_tool.js";
 import { ViewsTool } from "./views_tool.js";
 
-const MERGED_TEXT = "This file holds several models. The command 'hyrfpack edit' crops and turns all of them; " +
-  "with --part it takes one out, which can be edited here.";
+const MERGED_TEXT = "This file holds several models. 'hyrfpack edit' crops and turns them all, or takes one " +
+  "out by --part to edit here.";
 const TOOLS_FOR_ANY_FILE = ["measure", "views"]; // these change nothing
 
 export class Editor {

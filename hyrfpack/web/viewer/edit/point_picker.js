@@ -13,7 +13,7 @@ export class PointPicker {
 
   pick(x, y) {
     const point = this.editor.player.findPoint(x, y);
-    if (!point) return toast("There is nothing to pick at this place.");
+    if (!point) return toast("There is nothing to pick here.");
     this.points = [...this.points, point];
     this.picked(this.points);
   }

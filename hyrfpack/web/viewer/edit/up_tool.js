@@ -51,7 +51,7 @@ export class UpTool {
   state(direction) {
     const { editor } = this;
     editor.set(putAction(editor.actions, { option: "up", value: roundDirection(direction) }));
-    toast("Up is perpendicular to the ground now. Orbits turn about it.");
+    toast("Up is perpendicular to the ground; orbits turn about it.");
   }
 
   // Turns the scene; the command states up before, so that it does not depend on what the page knows of the file.

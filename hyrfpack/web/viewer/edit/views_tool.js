@@ -130,8 +130,5 @@ export class ViewsTool {
   }
 }
 
-function createButton(text, name, onclick) {
-  const button = Object.assign(document.createElement("button"), { textContent: text, title: name, onclick });
-  button.setAttribute("aria-label", name);
-  return button;
-}
+const createButton = (text, name, onclick) =>
+  Object.assign(document.createElement("button"), { textContent: text, title: name, ariaLabel: name, onclick });

@@ -6,6 +6,7 @@
 //                  those of the scene, the predicted PSNR in dB, and a sentence, "" for none
 
 import { Loader } from "../loader.js";
+import { decodeName } from "../source.js";
 import { StreamedFields } from "./streamed_fields.js";
 
 export const DEFAULT_GAUSSIANS = 2_000_000;
@@ -41,11 +42,26 @@ class StreamLoader extends Loader {
 
   // Opens the scene whose manifest `stream` yields.
   async read({ name, address, stage, stream }) {
-    const manifest = await gather(stream), { gaussians } = this, maxRows = this.player.renderer.largest[1];
-    const shown = this.expect(), [folder] = decodeURI(new URL(address).pathname).split("/").slice(-2);
+    const shown = this.expect();
+    const manifest = await Promise.race([this.gather(stream), shown]); // `shown` fails if the loader is disposed of
+    const { gaussians } = this, maxRows = this.player.renderer.largest[1];
+    const [folder] = new URL(address).pathname.split("/").slice(-2).map(decodeName);
     const ownName = name === MANIFEST_NAME && folder ? folder : name;
     this.post({ stream: { manifest, address, name: ownName, stage, gaussians, maxRows } });
     return shown;
+  }
+
+  // Returns all bytes of a stream, of which a manifest may have few.
+  async gather(stream) {
+    const parts = [];
+    let length = 0;
+    for await (const bytes of stream) {
+      if (this.broken) break; // ends the download
+      length += bytes.length;
+      if (length > MAX_MANIFEST_BYTES) throw new Error("The manifest is too long");
+      parts.push(bytes);
+    }
+    return new Uint8Array(await new Blob(parts).arrayBuffer());
   }
 
   post(message) {
@@ -162,16 +178,4 @@ function describeLoaded({ gaussians, bytes, totalBytes, psnr }, count) {
   const [, detail] = DETAILS.find(([least]) => psnr >= least);
   const drawn = `${gaussians.toLocaleString("en")} of ${count.toLocaleString("en")} Gaussians`;
   return [drawn, `${megabytes.join(" of ")} MB loaded, ${detail} detail here`];
-}
-
-// Returns all bytes of a stream, of which a manifest may have few.
-async function gather(stream) {
-  const parts = [];
-  let length = 0;
-  for await (const bytes of stream) {
-    length += bytes.length;
-    if (length > MAX_MANIFEST_BYTES) throw new Error("The manifest is too long");
-    parts.push(bytes);
-  }
-  return new Uint8Array(await new Blob(parts).arrayBuffer());
 }

@@ -1,0 +1,74 @@
+// Loads files without a browser, and drops them: `node loading.mjs`.
+//
+// Prints, as JSON, `loaderError`: the class of the error of a scene folder's loader that is disposed of before its
+// manifest has arrived; `folderName`: the name that another one gives a scene in a folder whose name is no valid
+// address; `cancelled`: whether a file that is not read is no longer downloaded, and whether the whole file is not,
+// which a server sends in place of the rest of a broken download; and `lifted`: what the controls of an embedded scene
+// report when a pointer is released that was pressed elsewhere.
+
+globalThis.window = globalThis.self = globalThis;
+globalThis.document = { baseURI: "http://host/" };
+globalThis.location = new URL("http://host/");
+globalThis.navigator ??= { hardwareConcurrency: 2 };
+globalThis.matchMedia = () => ({ matches: false });
+globalThis.addEventListener = globalThis.removeEventListener = () => {};
+const posted = [];
+globalThis.Worker = class {
+  postMessage(message) {
+    posted.push(message);
+  }
+
+  terminate() {}
+};
+const { STREAMING } = await import("../../hyrfpack/web/viewer/stream/stream_loader.js");
+const { fetchedFile } = await import("../../hyrfpack/web/viewer/source.js");
+const { Controls } = await import("../../hyrfpack/web/viewer/controls.js");
+
+const player = Object.assign(new EventTarget(), { renderer: { largest: [4096, 4096] }, maxGaussians: 1 });
+const createLoader = () => new STREAMING.StreamLoader({ player, workerAddress: "http://host/worker.js" });
+
+async function* stall() {
+  await new Promise(() => {});
+}
+const stalled = createLoader(), address = "http://host/50%/scene.json";
+const failed = stalled.read({ name: "scene.json", address, stage: null, stream: stall() }).catch((error) => error);
+stalled.dispose();
+const timeout = new Promise((done) => setTimeout(done, 2000, "none")), error = await Promise.race([failed, timeout]);
+
+async function* yieldManifest() {
+  yield new TextEncoder().encode("{}");
+}
+createLoader().read({ name: "scene.json", address, stage: null, stream: yieldManifest() });
+await new Promise((done) => setTimeout(done, 50));
+const folderName = posted.find(({ stream }) => stream)?.stream.name ?? null;
+
+// Returns an answer that records in `cancelled` that its body is cancelled.
+const cancelled = [false, false];
+const answerWith = (pull, number, status) => {
+  const body = new ReadableStream({ pull, cancel: () => (cancelled[number] = true) }, { highWaterMark: 0 });
+  return new Response(body, { status, headers: { "Content-Length": "100" } });
+};
+globalThis.fetch = async () => answerWith(() => {}, 0, 200);
+(await fetchedFile("http://host/a.hyrf")).stream.cancel?.();
+let pulls = 0;
+const breakOff = (controller) => {
+  if (pulls++) controller.error(new Error("broken"));
+  else controller.enqueue(new Uint8Array(10));
+};
+const answers = [answerWith(breakOff, 2, 200), answerWith(() => {}, 1, 200)];
+globalThis.fetch = async () => answers.shift();
+try {
+  for await (const bytes of (await fetchedFile("http://host/a.hyrf")).stream) void bytes;
+} catch {
+  // the download cannot be resumed
+}
+
+const lifted = [], canvas = Object.assign(new EventTarget(), { style: {} });
+canvas.getBoundingClientRect = () => ({ left: 0, top: 0 });
+const ignored = (kind) => lifted.push(kind);
+new Controls({ canvas }, null, { keyTarget: new EventTarget(), isEmbedded: true, acted: () => {}, ignored });
+canvas.dispatchEvent(Object.assign(new Event("pointerup"), { pointerId: 1, clientX: 5, clientY: 5 }));
+
+const loaderError = error.constructor.name;
+console.log(JSON.stringify({ loaderError, folderName, cancelled: cancelled.slice(0, 2), lifted }));
+process.exit();
