@@ -100,6 +100,10 @@ def test_the_player_keeps_the_gaussians_that_its_command_keeps(name: str, tmp_pa
         ("bonsai.hyrf", "hyrfpack edit bonsai.hyrf -o bonsai-edited.hyrf"),
         ("C:\\my scenes\\a.HYRF", "hyrfpack edit 'C:\\my scenes\\a.HYRF' -o a-edited.hyrf"),
         ("-rf $(x).hyrf", "hyrfpack edit './-rf $(x).hyrf' -o './-rf $(x)-edited.hyrf'"),
+        ("Bob's room.hyrf", '''hyrfpack edit "Bob's room.hyrf" -o "Bob's room-edited.hyrf"'''),
+        ("Bob\u2019s room.hyrf", 'hyrfpack edit "Bob\u2019s room.hyrf" -o "Bob\u2019s room-edited.hyrf"'),
+        ("C:\\Bob's\\a.hyrf", """hyrfpack edit "C:\\Bob's\\a.hyrf" -o a-edited.hyrf"""),
+        ("Bob's $5.hyrf", r"hyrfpack edit 'Bob'\''s $5.hyrf' -o 'Bob'\''s $5-edited.hyrf'"),
     ],
 )
 def test_a_command_names_files_safely(file: str, words: str, tmp_path: Path):

@@ -36,10 +36,12 @@ from web.pages import (
     psnr,
     random_splats,
     render_in_page,
+    wait_for_message,
     wait_until,
     wait_until_at_rest,
     window_camera,
 )
+from web.site import GOLDEN_FILE_DATA, Site, drop_file
 from web.test_merged import make_page as make_merged_page
 from web.test_merged import make_parts
 
@@ -268,6 +270,35 @@ def test_a_box_that_keeps_nothing_is_reported(browser: Browser, tmp_path: Path):
         fill(browser, f"#edit-box tr:nth-child(2) td:nth-child({column}) input", 4000)
     assert wait_until_applied(browser) == 0
     assert read_text(browser, "edit-count") == "No Gaussian is left."
+
+
+def test_an_edit_that_fails_is_not_saved_and_is_tried_again(browser: Browser, tmp_path: Path):
+    load_editable_page(browser, tmp_path, make_editable_page(make_model()), tool="save")
+    browser.evaluate(
+        "void (window.action = { option: 'min-opacity', value: 0.5 }, window.failure = new Error('no memory'),"
+        " hyrfpack.player.select = () => Promise.reject(failure), hyrfpack.editor.set([action]))"
+    )
+    assert wait_for_message(browser) == "no memory"
+    assert browser.evaluate("document.getElementById('edit-download').disabled")
+    browser.evaluate("void (document.getElementById('dismiss').click(), failure.message = '')")
+    browser.evaluate("hyrfpack.editor.set([action]), new Promise((done) => setTimeout(done, 100))")
+    assert browser.evaluate("document.getElementById('message').hidden"), "an error without a sentence"
+    browser.evaluate("delete hyrfpack.player.select, hyrfpack.editor.set([action])")
+    assert 0 < wait_until_applied(browser) < 600
+    assert not browser.evaluate("document.getElementById('edit-download').disabled")
+
+
+def test_a_command_names_the_file_of_the_address(browser: Browser, host: Site):
+    host.files["/index.html"] = encode_player(
+        "a title", content="some scene.hyrf", editable=True, file="own/bonsai.hyrf"
+    )
+    host.files["/room.hyrf"] = GOLDEN_FILE_DATA
+    for query, file in (("", "own/bonsai.hyrf"), ("?content=room.hyrf&title=Mine", "room.hyrf")):
+        browser.open(f"{host.address}/index.html{query}")
+        browser.evaluate("hyrfpack.ready")
+        assert browser.evaluate("hyrfpack.editor.file") == file
+    drop_file(browser, GOLDEN_FILE_DATA, "other.hyrf")
+    wait_until(browser, "hyrfpack.editor.file === 'other.hyrf'")
 
 
 def test_the_edit_survives_a_lost_graphics_device(browser: Browser, tmp_path: Path):

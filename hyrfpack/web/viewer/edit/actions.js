@@ -109,7 +109,8 @@ export function roundLength(value, size) {
 // Rounds the parts of a unit vector.
 export const roundDirection = (vector) => vector.map((part) => Number(part.toFixed(DIRECTION_DIGITS)) + 0);
 
-// Returns the command that applies actions to a file, for POSIX shells and PowerShell.
+// Returns the command that applies actions to a file, for POSIX shells and PowerShell; for the former alone if the
+// file's name has both an apostrophe and a character that is special in double quotes.
 export function commandText(actions, file) {
   const stem = file.split(/[\\/]/).pop().replace(/\.hyrf$/i, "") || "scene";
   const options = actions.map(({ option, value, isInverted }) => {
@@ -118,8 +119,10 @@ export function commandText(actions, file) {
   return ["hyrfpack edit", shellWord(file), "-o", shellWord(`${stem}-edited.hyrf`), ...options].join(" ");
 }
 
-// Returns a path as one word of a shell.
+// Returns a path as one word of a shell, in double quotes if it has an apostrophe and nothing that is special in them.
+// To PowerShell, typographic quotes are quotes, too.
 function shellWord(path) {
   const word = path.startsWith("-") ? `./${path}` : path;
-  return /^[\p{L}\p{N}_.\/:+-]+$/u.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`;
+  if (/^[\p{L}\p{N}_.\/:+-]+$/u.test(word)) return word;
+  return /["“-„$`!]|\\\W|^[^'’]*$/.test(word) ? `'${word.replaceAll("'", "'\\''")}'` : `"${word}"`;
 }

@@ -46,7 +46,7 @@ export class Editor {
     this.history = new History([]);
     this.actions = []; // those that are shown: the last state of the history, or one that is being changed
     this.count = null; // of the Gaussians that are left, null until it is known
-    this.applied = "[]"; // the selections that the player shows, as JSON
+    this.applied = "[]"; // the selections that the player shows, as JSON; null if that is unknown
     for (const tool of Object.values(this.tools ?? {})) tool.reset?.();
     if (this.tools) this.toggle(false);
   }
@@ -58,8 +58,8 @@ export class Editor {
 
   // The name of the scene's file, or its path if the page knows it.
   get file() {
-    const { isOwn, title } = this.opener.shown;
-    return (isOwn && this.ownFile) || `${title}.hyrf`;
+    const { isOwn, name } = this.opener.shown;
+    return (isOwn && this.ownFile) || name;
   }
 
   get placement() {
@@ -141,16 +141,17 @@ export class Editor {
 
   // Applies the actions to the picture, the newest ones only if they change quickly.
   async apply() {
-    const { player } = this, { scene, up } = { ...this.placement, scene: player.scene };
-    player.eye.up = rotateBack(frameAxes(scene), rotateBack(this.placement.rows, up));
+    const { player, placement: { rows, up } } = this;
+    player.eye.up = rotateBack(frameAxes(player.scene), rotateBack(rows, up));
     if (this.isApplying) return;
     this.isApplying = true;
     try {
       for (;;) {
         const selections = selectionsOf(this.actions, player.scene), wanted = JSON.stringify(selections);
         if (wanted === this.applied) break;
-        this.applied = wanted;
+        this.applied = null;
         this.count = (await player.select(selections)).at(-1) ?? null;
+        this.applied = wanted;
         this.refresh();
       }
     } finally {

@@ -7,7 +7,7 @@ import { commandText } from "./actions.js";
 import { keepsGaussians, rewriteFile, writeKept } from "./rewrite.js";
 
 const NOTHING_TEXT = "Nothing is edited yet.";
-const UNCOMPRESSED_TEXT = "Save .hyrf stores what is left uncompressed, as the command does with --profile raw.";
+const UNCOMPRESSED_TEXT = "Save .hyrf stores what is left uncompressed, as the command with --profile raw.";
 
 export class SaveTool {
   constructor(editor) {
@@ -31,17 +31,18 @@ export class SaveTool {
   async download() {
     const { player: { loader }, actions, opener } = this.editor, bytes = await loader.ask({});
     const writer = document.querySelector("[name=generator]").content;
-    const write = async () => writeKept(bytes, await loader.ask({ decode: true }), actions, writer);
-    const file = await (keepsGaussians(actions) ? rewriteFile(bytes, actions, writer) : write());
+    const file = keepsGaussians(actions)
+      ? await rewriteFile(bytes, actions, writer)
+      : writeKept(bytes, await loader.ask({ decode: true }), actions, writer);
     const name = saveBlob(new Blob([file]), opener.shown.title, "-edited.hyrf");
     toast(`Saved as ${name}, ${(file.length / 1e3).toFixed()} kB.`);
   }
 
   refresh() {
-    const { actions, file } = this.editor, { count, isApplying } = this.editor;
+    const { actions, file, count, applied } = this.editor;
     element("edit-command").value = actions.length ? commandText(actions, file) : NOTHING_TEXT;
     element("edit-copy").disabled = !actions.length;
-    element("edit-download").disabled = !actions.length || count === 0 || isApplying;
+    element("edit-download").disabled = !actions.length || count === 0 || applied === null;
     element("edit-advice").textContent = keepsGaussians(actions) ? "" : UNCOMPRESSED_TEXT;
   }
 }
