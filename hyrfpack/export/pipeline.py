@@ -152,7 +152,7 @@ def _export_file(
             _check_cameras(loaded, source, data)
         if kind is TRANSFORMS_JSON:
             return _write_cameras(loaded, target, data, overwrite)
-        if kind is COLMAP_FOLDER and data is not None:
+        if kind is COLMAP_FOLDER and data is not None and data.train:
             loaded = replace(loaded, cameras=[(view.name, fit_to_file(view)) for view in data.train])
         with context.open_progress("export") as progress:
             if kind in MESH_FILES:
@@ -214,7 +214,7 @@ def _check_cameras(loaded: Source, source: str | os.PathLike[str], data: Scene |
             f"{source}: it keeps {kept}",
             fix="export the cameras from the file that training wrote, or give the photos with `data`",
         )
-    if data is None:
+    if data is None or not data.train:
         name, camera = loaded.cameras[0]
         _LOG.warning(
             f"{source} does not keep the names of its photos, so the cameras are named {name} and so on, and are those "
@@ -227,7 +227,8 @@ def _check_cameras(loaded: Source, source: str | os.PathLike[str], data: Scene |
         raise HyrfError(
             f"{data.path}: {len(resampled):,} of {len(data.train):,} photos (such as {resampled[0]}) are undistorted "
             "or turned upright as they are loaded, or cut from panoramas, so the model's cameras do not fit the files",
-            fix="undistort the photos (COLMAP's image_undistorter) and give the new folder with `data`",
+            fix="undistort the photos (COLMAP's image_undistorter) or save them upright (exiftran -a), and give that "
+            "folder with `data`",
         )
 
 

@@ -60,7 +60,7 @@ def _add_file_scores(
     return replace(
         result,
         views=file.views,
-        views_fitted=any(camera in loaded.fit_cameras for camera, _ in loaded.measured_views),
+        views_fitted=loaded.fits_measured_views,
         psnr_baked=before.model,
         psnr=file.model,
         photos_model=scores["model"].photos,

@@ -48,6 +48,7 @@ class Source:
         center: (3,) point at the centre of interest, world units.
         photo_mse: mean squared error of the model's pictures against its photos, as stated in the file.
         has_coarse_cameras: whether `cameras` are approximate, as in small files, and so unsuitable for training.
+        fits_measured_views: whether `measured_views` are among `fit_cameras`, because there are too few cameras.
     """
 
     model: HybridModel
@@ -59,6 +60,7 @@ class Source:
     center: np.ndarray
     photo_mse: float
     has_coarse_cameras: bool = False
+    fits_measured_views: bool = False
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], data: Scene | None = None) -> Source:
@@ -96,7 +98,8 @@ class Source:
             return cls(model, drawn, [], _make_ring_cameras(viewpoint, center, up), measured_views, up, center, stated)
         named = [(f"camera-{number:04d}.png", camera) for number, camera in enumerate(cameras)]
         spare = fit_cameras = cameras
-        if len(cameras) >= (MIN_COARSE_CAMERAS_TO_HOLD_OUT if capture.is_coarse else MIN_CAMERAS_TO_HOLD_OUT):
+        holds_out = len(cameras) >= (MIN_COARSE_CAMERAS_TO_HOLD_OUT if capture.is_coarse else MIN_CAMERAS_TO_HOLD_OUT)
+        if holds_out:
             spare = cameras[::HELD_OUT_INTERVAL]
             fit_cameras = [camera for number, camera in enumerate(cameras) if number % HELD_OUT_INTERVAL]
         measured_views = [(camera, None) for camera in evenly_spaced(spare, MAX_MEASURED_VIEWS)]
@@ -107,7 +110,16 @@ class Source:
             ]
             fit_cameras = [*fit_cameras, *between, *_make_ring_cameras(viewpoint, center, up)]
         return cls(
-            model, drawn, named, fit_cameras, measured_views, _choose_up(cameras, up), center, stated, capture.is_coarse
+            model,
+            drawn,
+            named,
+            fit_cameras,
+            measured_views,
+            _choose_up(cameras, up),
+            center,
+            stated,
+            has_coarse_cameras=capture.is_coarse,
+            fits_measured_views=not holds_out,
         )
 
 

@@ -98,7 +98,7 @@ def _encode_ply(mesh: Mesh, positions: np.ndarray) -> bytes:
 
 def _encode_obj(mesh: Mesh) -> bytes:
     # Nine digits are as fine as float32. Far from the origin, the first of them do not tell positions apart.
-    reach, size = np.abs(mesh.vertices).max(), np.ptp(mesh.vertices, axis=0).max()
+    reach, size = (np.abs(mesh.vertices).max(), np.ptp(mesh.vertices, axis=0).max()) if len(mesh.vertices) else (0, 0)
     digits = 9 + math.floor(math.log10(reach / size)) if reach > size > 0 else 9
     number = f".{min(digits, 17)}g"
     lines = [f"v {x:{number}} {y:{number}} {z:{number}}" for x, y, z in mesh.vertices.tolist()]

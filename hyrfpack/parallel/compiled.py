@@ -26,6 +26,8 @@ class _TolerantCache(FunctionCache):
 
     def __init__(self, function):
         super().__init__(function)
+        if not hasattr(self._cache_file, "_source_stamp"):
+            raise RuntimeError("this Numba stamps kernels in another way, so that old ones could not be told from new")
         package = ".".join(function.__module__.split(".")[:2])
         self._cache_file._source_stamp = self._cache_file._source_stamp, _source_digest(package)
 
@@ -41,8 +43,8 @@ class _TolerantCache(FunctionCache):
 
 @cache
 def _source_digest(package: str) -> str:
-    """Return a digest of all Python files of an imported package, as they were at the first call."""
-    digest = hashlib.sha256()
+    """Return a digest of this file and all Python files of an imported package, as they were at the first call."""
+    digest = hashlib.sha256(Path(__file__).read_bytes())
     for folder in getattr(sys.modules.get(package), "__path__", ()):  # A module that is no package has none.
         for path in sorted(Path(folder).rglob("*.py")):
             with suppress(OSError):  # Lock files of editors are links to nothing.
@@ -62,12 +64,13 @@ def can_cache_kernels() -> bool:
 def compiled(**options: Any) -> Callable[[Callable], Callable]:
     """Decorate a function with `numba.njit(nogil=True, **options)` and cache its machine code on disk.
 
-    If nothing can be cached (the disk is full or no folder is writable), each process compiles the kernel again.
+    If nothing can be cached (the disk is full or no folder is writable), each process compiles the kernel again. A
+    change of any Python file of its package makes the next process do so, too.
     """
 
     def decorate(function: Callable) -> Callable:
         kernel = numba.njit(nogil=True, **options)(function)
-        with suppress(RuntimeError):  # Numba raises this if it finds no writable folder.
+        with suppress(RuntimeError):  # There is no writable folder, or Numba has changed.
             kernel._cache = _TolerantCache(function)
         return kernel
 

@@ -143,8 +143,9 @@ class _Server(ThreadingHTTPServer):
 
     @property
     def ip_address(self) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
-        """The address at which the server listens."""
-        return ipaddress.ip_address(str(self.server_address[0]))
+        """The address at which the server listens; for IPv4 addresses that IPv6 contains, the IPv4 address."""
+        address = ipaddress.ip_address(str(self.server_address[0]))
+        return getattr(address, "ipv4_mapped", None) or address
 
     def server_bind(self) -> None:
         """Bind the socket; `HTTPServer` also looks up a name of the host, which may wait for a name server."""
@@ -166,7 +167,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(
                 HTTPStatus.FORBIDDEN,
                 explain="Only browsers of this machine can open this page, by the name localhost. "
-                "To open it on another machine, forward its port (ssh -L).",
+                "To open it on another machine, forward its port (ssh -L), or use 'hyrfpack view' with host 0.0.0.0.",
             )
             return
         path = self.path.partition("?")[0]
@@ -287,7 +288,8 @@ def _create_server(host: str, port: int, page: bytes, files: ServedFiles) -> _Se
             fix="name another port or host",
         ) from error
     if server.ip_address.is_loopback:
-        server.allowed_hosts = _LOCAL_NAMES | {_host_in_address(host).lower()}
+        own_names = {_host_in_address(name).lower() for name in (host, str(server.ip_address))}
+        server.allowed_hosts = _LOCAL_NAMES | own_names
     server.page = page
     server.files = {f"/{name}": file if isinstance(file, MemoryFile) else Path(file) for name, file in files.items()}
     return server

@@ -185,6 +185,15 @@ def test_exported_cameras_fit_the_photo_files(plain_file, tmp_path):
     assert {camera.width for camera in cameras.values()} == {8}
 
 
+@pytest.mark.parametrize("target", ["transforms.json", "colmap"])
+def test_photos_without_training_photos_leave_the_cameras_of_the_file(target, plain_file, tmp_path, caplog):
+    pytest.importorskip("pycolmap")
+    held_out = replace(ball_scene(4), train=[])
+    count = export(plain_file, tmp_path / "expected" / target).cameras
+    assert count and export(plain_file, tmp_path / target, data=held_out).cameras == count
+    assert caplog.text.count("does not keep the names of its photos") == 2
+
+
 def test_a_colmap_export_writes_a_model_and_reports_its_size(plain_file, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     (tmp_path / "colmap").mkdir()

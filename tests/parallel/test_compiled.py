@@ -7,9 +7,9 @@ import sys
 
 import numba
 import pytest
-from numba.core.caching import CompileResultCacheImpl
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
 
-from hyrfpack.parallel.compiled import _source_digest, compiled
+from hyrfpack.parallel.compiled import _source_digest, can_cache_kernels, compiled
 
 
 def twice(x):
@@ -76,3 +76,15 @@ def test_a_kernel_runs_on_a_full_disk_and_leaves_no_index_without_its_code(folde
 def test_a_kernel_runs_without_a_cache_folder(monkeypatch):
     monkeypatch.setattr(CompileResultCacheImpl, "_locator_classes", [])
     assert compiled()(twice)(21) == 42
+
+
+def test_kernels_are_not_cached_by_a_numba_that_stamps_them_in_another_way(folder, monkeypatch):
+    class OtherCacheFile:
+        pass
+
+    def open_other(cache, function):
+        cache._cache_file = OtherCacheFile()
+
+    monkeypatch.setattr(FunctionCache, "__init__", open_other)
+    assert not can_cache_kernels()
+    assert compiled()(twice)(21) == 42 and cached_suffixes(folder) == []

@@ -29,8 +29,15 @@ def test_files_beside_the_folders_of_runs_are_ignored(tmp_path):
 def test_a_run_is_reused_only_with_its_settings(change, is_same, tmp_path):
     config = TrainConfig(steps=5, exposure=False)
     assert not has_run(tmp_path, config)
-    (tmp_path / "metrics.json").write_text(json.dumps({"settings": config.to_dict()}))
+    (tmp_path / "metrics.json").write_text(json.dumps({"settings": config.to_dict(), "choices": {}}))
     assert has_run(tmp_path, replace(config, **change)) == is_same
+
+
+@pytest.mark.parametrize(("choices", "steps", "is_same"), [({"steps": "7"}, 9, True), ({"steps": "7"}, 5, False)])
+def test_a_run_that_pilots_made_shorter_is_reused(choices, steps, is_same, tmp_path):
+    settings = TrainConfig(steps=7, exposure=False).to_dict()
+    (tmp_path / "metrics.json").write_text(json.dumps({"settings": settings, "choices": choices}))
+    assert has_run(tmp_path, TrainConfig(steps=steps)) == is_same
 
 
 def test_runs_of_other_steps_have_other_folders(tmp_path, monkeypatch):

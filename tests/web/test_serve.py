@@ -234,10 +234,10 @@ def replaced_getsockname(network_host: str) -> Callable[[socket.socket], tuple]:
 def test_a_server_for_all_addresses_names_one_for_this_machine_and_one_for_others(
     host: str, local_name: str, network_name: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
-    opened, said = [], []
+    opened, said, is_opened = [], [], threading.Event()
     skip_without_ipv6(host)
-    monkeypatch.setattr("webbrowser.open", opened.append)
-    monkeypatch.setattr(serving._Server, "serve_forever", lambda server: None)
+    monkeypatch.setattr("webbrowser.open", lambda address: (opened.append(address), is_opened.set()))
+    monkeypatch.setattr(serving._Server, "serve_forever", lambda server: is_opened.wait(60))
     monkeypatch.setattr(socket.socket, "connect", lambda probe, address: None)
     monkeypatch.setattr(socket.socket, "getsockname", replaced_getsockname(network_name.strip("[]")))
     with caplog.at_level(logging.INFO, "hyrfpack"):

@@ -74,9 +74,9 @@ def train_and_score(
     is the share of the bytes of the version's default file that the scored file may have; 1 for that file itself.
     """
     suffix = "" if size == 1 else f"-{size:g}"
-    is_better = out / f"scores{suffix}.json"
-    if is_better.exists():
-        return json.loads(is_better.read_text())
+    scores_file = out / f"scores{suffix}.json"
+    if scores_file.exists():
+        return json.loads(scores_file.read_text())
     cpu_time = out / "cpu_seconds.json"  # The last file of a training.
     if not cpu_time.exists():
         settings = ["--steps", str(steps), "--seed", str(seed), "--overwrite", *options]
@@ -96,7 +96,7 @@ def train_and_score(
         "seconds": json.loads(cpu_time.read_text()),
         "gaussians": json.loads((out / "metrics.json").read_text())["gaussians"],
     }
-    is_better.write_text(json.dumps(result))
+    scores_file.write_text(json.dumps(result))
     return result
 
 

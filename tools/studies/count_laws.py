@@ -3,7 +3,8 @@
     python -m tools.studies.count_laws --sets mipnerf360_bonsai --sizes 400 200 --counts 8000 16000 32000 64000
     python -m tools.studies.count_laws --table --survey results          prints the table, and writes CSV files
 
-Runs are kept in --out/SET/STEPS/SIZE/COUNT. Those that are there are not repeated.
+Runs are kept in --out/SET/STEPS/SIZE/COUNT. Those that are there are not repeated, unless --lpips-weights are given and
+a run has no LPIPS.
 
 The first table has one row for each run: PSNR (dB) and SSIM of the compact file on held-out photos, its bytes, and its
 bits per Gaussian of positions, of the other properties, of the hash tables, and of decoders and metadata. The second
@@ -147,7 +148,9 @@ def main() -> None:
     parser.add_argument("--counts", type=int, nargs="+", default=[8000, 16000, 32000, 64000], help="Gaussians")
     parser.add_argument("--lpips-weights", type=Path, help="weights of the lpips package")
     parser.add_argument("--survey", type=Path, help="folder for CSV files")
-    parser.add_argument("--table", action="store_true", help="train nothing, and print what --out has")
+    parser.add_argument(
+        "--table", action="store_true", help="train nothing, and print what --out has for these --steps"
+    )
     args = parser.parse_args()
     for name in args.sets:
         out = args.out / name / str(args.steps)

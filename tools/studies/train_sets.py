@@ -31,12 +31,18 @@ DATA_FOLDER = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[3] 
 
 
 def has_run(out: Path, config: TrainConfig) -> bool:
-    """Return whether a folder has a run with these steps, this seed and, unless pilot runs decide, this exposure."""
+    """Return whether a folder has a run with these steps, this seed and, unless pilot runs decide, this exposure.
+
+    A run of which pilot runs chose the number of steps may have taken fewer.
+    """
     if not (out / "metrics.json").exists():
         return False
-    settings = json.loads((out / "metrics.json").read_text())["settings"]
-    names = ["steps", "seed"] + (["exposure"] if config.exposure is not None else [])
-    return all(settings[name] == getattr(config, name) for name in names)
+    metrics = json.loads((out / "metrics.json").read_text())
+    settings = metrics["settings"]
+    names = ["seed"] + (["exposure"] if config.exposure is not None else [])
+    is_chosen = config.early_stop and "steps" in metrics["choices"] and settings["steps"] < config.steps
+    has_steps = settings["steps"] == config.steps or is_chosen
+    return has_steps and all(settings[name] == getattr(config, name) for name in names)
 
 
 def measure(data: Path, name: str, out: Path, config: TrainConfig, reuse: bool) -> dict:
@@ -125,7 +131,7 @@ def main() -> None:
         action=argparse.BooleanOptionalAction,
         help="learn per-image gains or not (default: pilot runs decide)",
     )
-    parser.add_argument("--reuse", action="store_true", help="do not repeat training runs that --out already has")
+    parser.add_argument("--reuse", action="store_true", help="do not repeat runs that --out has with these settings")
     args = parser.parse_args()
     out = args.out or Path("runs/sets") / str(args.steps)
     names = args.sets or sorted(
