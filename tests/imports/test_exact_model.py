@@ -75,7 +75,7 @@ def test_an_import_stores_what_the_target_needs(tmp_path: Path, monkeypatch: pyt
     small, large = (import_them(psnr=psnr) for psnr in (38, 50))
     assert small.psnr_unpacked > 55 and small.psnr > 36 and large.psnr > 47  # of 2 views
     # `compress` takes its default error from this number, which is not that of the model before compression.
-    assert describe_file(tmp_path / "x.hyrf")["provenance"]["psnr"] == 50
+    assert describe_file(tmp_path / "x.hyrf")["provenance"]["psnr"] == pytest.approx(large.psnr, abs=0.006)
     assert large.bytes_after > 1.2 * small.bytes_after  # metadata takes half of these
     limit = (small.bytes_after + large.bytes_after) // 2
     filled = import_them(target_bytes=limit)

@@ -45,7 +45,7 @@ def copy_dataset(source: Path, target: Path) -> None:
         photo = target / "images" / view.name
         photo.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source / "images" / view.name, photo)
-    content = json.loads(encode_transforms([(view.name, view.camera) for view in views]))
+    content = json.loads(encode_transforms([(f"images/{view.name}", view.camera) for view in views]))
     content["ply_file_path"] = POINTS_FILE
     (target / "transforms.json").write_text(json.dumps(content))
     (target / POINTS_FILE).write_bytes(encode_colored_points(scene.points, np.round(255 * scene.point_colors)))
