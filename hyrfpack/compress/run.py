@@ -218,12 +218,15 @@ def _prepare_packer(
             f"{source}: there is no Gaussian in it, so there is nothing to measure",
             fix="use profile 'paper'",
         )
-    cameras = Capture(describe_file(source), data).cameras
+    capture = Capture(describe_file(source), data)
+    cameras = capture.cameras
     _LOG.info(f"measuring how each stored number affects renders, at {len(cameras)} cameras and between them")
     steps = config.finetune_steps or 0
     start = config.distortion or default_distortion(provenance, steps)
     sensitivity, references = measure_calibrated_sensitivity(model, cameras, start, config.prune, measuring_progress)
-    if not sensitivity.is_seen:
+    # The model of a uniform wall or sky may be all background, at cameras that are known to be its own.
+    has_own_cameras = data is None or ("cameras" in provenance and not capture.mismatch)
+    if not sensitivity.is_seen and not (model.config.background and has_own_cameras):
         raise HyrfError(
             f"{source}: none of its {len(cameras)} cameras sees a Gaussian, so there is nothing to measure",
             fix="name photos that show the model with `data`, or use profile 'paper'",

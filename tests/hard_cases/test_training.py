@@ -28,6 +28,7 @@ from hyrfpack.model import Frame, HybridModel
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train import Trainer
+from hyrfpack.train.provenance import training_provenance
 from hyrfpack.train.resolution import MIN_BACKGROUND_STRIDE
 from hyrfpack.train.setup import MAX_INITIAL_COORDINATE, initial_points
 
@@ -146,9 +147,10 @@ def train_trainer(scene: Scene, steps: int = 100, exposure: bool = False) -> Tra
 def compress_to_bytes(profile: str, trainer: Trainer) -> bytes:
     """Return the file that `hyrfpack compress` writes, with two photos for the profiles that use them."""
     photos = dataclasses.replace(trainer.scene, train=trainer.scene.train[:2])  # enough to measure sensitivity
+    psnr = min(mean_psnr(trainer.model, trainer.scene.train), 99.0)
     with TemporaryDirectory() as folder:
         raw, packed = Path(folder) / "model.hyrf", Path(folder) / "packed.hyrf"
-        save_model(trainer.model, raw, "raw", {"psnr": min(mean_psnr(trainer.model, trainer.scene.train), 99.0)})
+        save_model(trainer.model, raw, "raw", {**training_provenance(trainer.scene), "psnr": psnr})
         compress_model(raw, packed, CompressConfig(profile=profile), data=photos if profile == "compact" else None)
         return packed.read_bytes()
 
