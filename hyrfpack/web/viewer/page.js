@@ -169,7 +169,7 @@ function start({ startEditing = () => {}, streaming = null, watchTraining }) {
   });
   player.addEventListener("opened", ({ detail }) => {
     navigation.stop();
-    opener.shown = player.loader.origin;
+    opener.shown = player.loader.origin ?? opener.shown;
     if (detail.isStreamed && !opener.shown.isNamed) opener.shown.title = detail.title; // the manifest has it
     panel.describe(detail, opener.shown.title);
     element("credit").hidden = !(opener.shown.isOwn && isCredited);
