@@ -27,7 +27,7 @@ class _TolerantCache(FunctionCache):
     def __init__(self, function):
         super().__init__(function)
         if not hasattr(self._cache_file, "_source_stamp"):
-            raise RuntimeError("this Numba stamps kernels in another way, so that old ones could not be told from new")
+            raise RuntimeError("this Numba stamps cached kernels in another way, so stale ones would not be detected")
         package = ".".join(function.__module__.split(".")[:2])
         self._cache_file._source_stamp = self._cache_file._source_stamp, _source_digest(package)
 
