@@ -17,7 +17,7 @@ from hyrfpack.parallel.pool import run_tasks, torch_on_one_thread
 _MAX_ROWS_PER_CHUNK = 2048  # The activations of a chunk (0.5 MiB at width 64) then stay in the L2 cache.
 _MIN_ROWS_PER_CHUNK = 256
 # Above this ratio of rows without a gradient, gathering the other rows is faster than computing all of them.
-_MIN_IDLE_ROW_RATIO = 0.2
+_MIN_IDLE_ROW_RATIO = 0.1
 
 # Hidden activations of more rows are not stored; at width 64 and two hidden layers they would take 128 MiB.
 MAX_STORED_ROWS = 1 << 18
