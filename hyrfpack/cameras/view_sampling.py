@@ -123,6 +123,11 @@ def shrink_camera(camera: Camera, max_side: int = MAX_SMALL_VIEW_SIDE_PIXELS) ->
 def resize_camera(camera: Camera, ratio: float) -> Camera:
     """Return a camera whose picture has a ratio of the pixels of each axis; the view stays about the same."""
     width, height = (max(1, round(ratio * side)) for side in (camera.width, camera.height))
+    return fit_camera(camera, width, height)
+
+
+def fit_camera(camera: Camera, width: int, height: int) -> Camera:
+    """Return a camera with the same view whose picture has `width` x `height` pixels."""
     x, y = width / camera.width, height / camera.height
     return dataclasses.replace(
         camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y

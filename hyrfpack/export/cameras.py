@@ -7,12 +7,12 @@ import os
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from hyrfpack.atomic import pending_file
+from hyrfpack.cameras.view_sampling import fit_camera
 from hyrfpack.colmap_library import load_pycolmap
 from hyrfpack.data.archive import display_path
 from hyrfpack.data.pictures import PhotoFile
@@ -32,11 +32,7 @@ def fit_to_file(view: View) -> Camera:
     camera = view.camera
     if not isinstance(view.load, PhotoFile) or view.load.stored == (camera.width, camera.height):
         return camera
-    width, height = view.load.stored
-    x, y = width / camera.width, height / camera.height
-    return replace(
-        camera, width=width, height=height, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y
-    )
+    return fit_camera(camera, *view.load.stored)
 
 
 def locate_photo(view: View, folder: str | os.PathLike[str]) -> str:

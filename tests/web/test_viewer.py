@@ -215,11 +215,11 @@ def test_a_screenshot_is_completed_out_of_the_window(browser: Browser, site: Sit
     open_viewer(browser, site)
     wait_until(browser, READY_JS)
     browser.evaluate(
-        "Object.defineProperty(viewer.player, 'settled', { get: () => new Promise((done) => { window.go = done; }) }),"
+        "Object.defineProperty(viewer.player, 'settled', { get: () => new Promise((r) => { window.settle = r; }) }),"
         "window.picture = viewer.screenshot(), viewer.watch(false)"
     )
     assert not browser.evaluate("viewer.player.paused")
-    assert browser.evaluate("go(), picture.then(({ type }) => type)") == "image/png"
+    assert browser.evaluate("settle(), picture.then(({ type }) => type)") == "image/png"
     assert browser.evaluate("viewer.player.paused")
 
 
