@@ -14,10 +14,10 @@ from hyrfpack.ops.viewport import Viewport
 PICTURE_WIDTH = 64
 PICTURE_HEIGHT = 40
 CAMERA_INTRINSICS = (50.0, 60.0, 20.0, 25.0)
-TESTED_IMPLEMENTATIONS = ["reference", pytest.param("gpu", marks=needs_triton)]
+TESTED_IMPLEMENTATIONS = ["reference", "cpu", pytest.param("gpu", marks=needs_triton)]
 CAMERA_POSE = look_at((0.0, -3.0, 0.0), (0.0, 0.0, 0.0))
-# Relative widths of the band in which rounding decides. The kernel works in float64.
-UNDECIDED_RATIO = {"reference": 1e-4, "gpu": 1e-12}
+# Relative widths of the band in which rounding decides. The kernels work in float64.
+UNDECIDED_RATIO = {"reference": 1e-4, "cpu": 1e-12, "gpu": 1e-12}
 # The warning is numpy's, in the interpreter.
 IGNORE_INVALID_PRODUCT_WARNING = pytest.mark.filterwarnings("ignore:invalid value encountered in multiply")
 POINT_AHEAD = (0.0, -2.0, 0.0)
@@ -114,18 +114,38 @@ def test_points_on_the_near_plane_are_culled(implementation):
     assert cull(points, np.eye(4), implementation, near=0.5).tolist() == [1]
 
 
-@needs_triton
-def test_the_kernel_uses_a_float64_pose_at_full_precision():
+@pytest.mark.parametrize("implementation", [name for name in TESTED_IMPLEMENTATIONS if name != "reference"])
+def test_kernels_use_a_float64_pose_at_full_precision(implementation):
     """A rotation by 1e-9, which float32 cannot represent, decides about a point just outside the picture."""
     width, angle = 64 / 2 * 1.3, 1e-9
     turned = np.eye(4)
     turned[:3, :3] = [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
     lens = (width, 60.0, 32.0, 25.0)  # the edge of the band is at x = z
-    found = [
-        frustum_cull(gpu(torch.tensor([[1.0, 0, 1]])), viewport, 0.01, 0.3, implementation="gpu").tolist()
+    point = torch.tensor([[1.0, 0, 1]])
+    point = gpu(point) if implementation == "gpu" else point
+    kept = [
+        frustum_cull(point, viewport, 0.01, 0.3, implementation=implementation).tolist()
         for viewport in (Viewport(torch.from_numpy(pose), lens, 64, 40) for pose in (turned, turned.T.copy()))
     ]
-    assert found == [[0], []]
+    assert kept == [[0], []]
+
+
+@pytest.mark.parametrize("threads", ["1", "3"])
+def test_many_points_are_listed_in_order_on_any_number_of_threads(threads, monkeypatch):
+    monkeypatch.setenv("HYRFPACK_THREADS", threads)
+    points = np.random.default_rng(5).normal(size=(200_000, 3)) * 3
+    kept, unsure = in_view(points, CAMERA_POSE, 0.01, 0.3, UNDECIDED_RATIO["cpu"])
+    assert not unsure
+    assert cull(points, implementation="cpu").tolist() == sorted(kept)
+    points[-1, 2] = np.nan
+    with pytest.raises(FloatingPointError):
+        cull(points, implementation="cpu")
+
+
+@pytest.mark.parametrize("implementation", TESTED_IMPLEMENTATIONS)
+def test_an_infinite_band_keeps_all_points_in_front_of_the_camera(implementation):
+    points = [POINT_AHEAD, POINT_BEHIND, (1e6, -2.0, 0.0), (0.0, -2.9, -1e6)]
+    assert cull(points, implementation=implementation, tolerance=np.inf).tolist() == [0, 2, 3]
 
 
 @IGNORE_INVALID_PRODUCT_WARNING
@@ -174,5 +194,7 @@ def test_unknown_types_and_implementations_are_rejected():
     rest = make_viewport(torch.eye(4)), 0.01, 0.3
     with pytest.raises(ValueError, match="float32"):
         frustum_cull(torch.zeros(2, 3).double(), *rest, implementation="gpu")
-    with pytest.raises(ValueError, match="no implementation 'cpu'"):
-        frustum_cull(torch.zeros(2, 3), *rest, implementation="cpu")
+    with pytest.raises(ValueError, match="float32"):
+        frustum_cull(torch.zeros(2, 3).double(), *rest, implementation="cpu")
+    with pytest.raises(ValueError, match="no implementation 'fast'"):
+        frustum_cull(torch.zeros(2, 3), *rest, implementation="fast")

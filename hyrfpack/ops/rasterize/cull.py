@@ -20,7 +20,7 @@ def frustum_cull(
         viewport: the camera.
         near: smallest depth kept (exclusive), world units.
         tolerance: width of the band as a fraction of half the image's width and height (NDC units).
-        implementation: "auto", "reference" or "gpu" (float32 positions; computes in float64).
+        implementation: "auto", "reference", or "cpu" or "gpu" (float32 positions; compute in float64).
 
     Returns:
         (n,) int64, ascending.
@@ -29,10 +29,15 @@ def frustum_cull(
         FloatingPointError: a position is NaN or infinite; comparisons alone would drop it silently.
         ValueError: the implementation does not support these positions.
     """
-    if choose_implementation("frustum_cull", implementation, ("reference", "gpu"), positions) == "gpu":
+    chosen = choose_implementation("frustum_cull", implementation, ("reference", "cpu", "gpu"), positions)
+    if chosen == "gpu":
         from hyrfpack.ops.rasterize import gpu_cull
 
         return gpu_cull.frustum_cull(positions, viewport, near, tolerance)
+    if chosen == "cpu":
+        from hyrfpack.ops.rasterize import cpu_cull
+
+        return cpu_cull.frustum_cull(positions, viewport, near, tolerance)
     if not all_finite(positions):
         raise FloatingPointError("positions hold NaN or infinity")
     pose, width, height = viewport.pose.to(positions), viewport.width, viewport.height
