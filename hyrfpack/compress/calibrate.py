@@ -83,7 +83,7 @@ def calibrate(
         sensitivity = _match_measurements(sensitivity, pruning, distortion, part_of_progress(progress, 0.0, 0.2))
     kept = indices_to_keep(sensitivity, distortion_per_number(model, distortion), prune)
     pruned, decoded = subset_decoded(model, decoded, kept)
-    references = ReferenceRenders.from_views(references.views, pruned, decoded)
+    references = ReferenceRenders.from_views(references.views, pruned, decoded, references.colors_of(kept))
     quantization = QuantizationErrors(model, pruned, decoded, references, distortion, prune)
     return _match_measurements(sensitivity, quantization, distortion, part_of_progress(progress, 0.2, 1.0))
 

@@ -48,6 +48,10 @@ QUANTIZED_PARTS: tuple[Part, ...] = (
 )
 
 
+# The sections that the colours of Gaussians depend on, apart from positions.
+COLOR_SECTIONS = frozenset((COLORS, HARMONICS, RADIANCE_TABLE))
+
+
 @dataclass(frozen=True)
 class ErrorMeasurement:
     """The mean squared error that a part adds to pictures: measured on renders, and predicted by sensitivities."""
@@ -96,7 +100,8 @@ class PruningErrors:
         progress(TaskEvent("calibrating the prediction of pruning errors", 0.0))
         kept = indices_to_keep(sensitivity, distortion_per_number(self.model, self.distortion))
         predicted = float(np.delete(sensitivity.removals, kept).sum())
-        measured = self.references.measure_error(*subset_decoded(self.model, self.decoded, kept))
+        model, decoded = subset_decoded(self.model, self.decoded, kept)
+        measured = self.references.measure_error(model, decoded, self.references.colors_of(kept))
         return {part: ErrorMeasurement(measured, predicted) for part in parts}
 
 
@@ -154,7 +159,8 @@ class QuantizationErrors:
         if part == (POSITIONS,):
             return self.references.measure_error(planned)
         changed = _replace_arrays(self.pruned, {name: arrays[name] for name in part})
-        return self.references.measure_error(changed, update_decoded(changed, self.decoded, part))
+        colors = None if COLOR_SECTIONS.intersection(part) else self.references.colors
+        return self.references.measure_error(changed, update_decoded(changed, self.decoded, part), colors)
 
 
 def subset_decoded(model: HybridModel, decoded: Decoded, kept: np.ndarray) -> tuple[HybridModel, Decoded]:

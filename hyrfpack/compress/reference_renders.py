@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -14,6 +14,7 @@ from hyrfpack.cameras.view_sampling import sample_views
 from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.parallel.pool import parallel_map
 from hyrfpack.render import render_view
+from hyrfpack.render.in_view import colors_in_view
 from hyrfpack.scene import Camera
 
 T = TypeVar("T")
@@ -32,10 +33,12 @@ class ReferenceRenders:
     Attributes:
         views: the cameras that were rendered.
         pictures: the render of each view, (H, W, 3) in [0, 1].
+        colors: the colours (N, 3) of the model's Gaussians in each view, see `colors_in_view`.
     """
 
     views: list[Camera]
     pictures: list[Tensor]
+    colors: list[Tensor]
 
     @classmethod
     def from_model(cls, model: HybridModel, cameras: Sequence[Camera]) -> ReferenceRenders:
@@ -47,11 +50,26 @@ class ReferenceRenders:
         return cls.from_views([*at, *between], model)
 
     @classmethod
-    def from_views(cls, views: list[Camera], model: HybridModel, decoded: Decoded | None = None) -> ReferenceRenders:
-        """Render a model at the given views; `decoded` is as in `measure_error`."""
-        return cls(views, _map_renders(model, views, decoded, lambda index, rgb: rgb))
+    def from_views(
+        cls,
+        views: list[Camera],
+        model: HybridModel,
+        decoded: Decoded | None = None,
+        colors: list[Tensor] | None = None,
+    ) -> ReferenceRenders:
+        """Render a model at the given views; `decoded` and `colors` are as in `measure_error`."""
+        decoded = model.decode() if decoded is None else decoded
+        if colors is None:
+            colors = _map_views(model, lambda index: colors_in_view(model, views[index], decoded), len(views))
+        return cls(views, _map_renders(model, views, decoded, colors, lambda index, rgb: rgb), colors)
 
-    def measure_error(self, model: HybridModel, decoded: Decoded | None = None) -> float:
+    def colors_of(self, index: np.ndarray) -> list[Tensor]:
+        """Return the colours (n, 3) in each view of the Gaussians at `index` (n,)."""
+        return [colors[torch.as_tensor(index, device=colors.device)] for colors in self.colors]
+
+    def measure_error(
+        self, model: HybridModel, decoded: Decoded | None = None, colors: Sequence[Tensor] | None = None
+    ) -> float:
         """Render a model at the same views and return the median over views of the mean squared colour difference.
 
         The median ignores single views in which a Gaussian comes very close to the camera.
@@ -59,23 +77,34 @@ class ReferenceRenders:
         Args:
             model: the model to compare with the references.
             decoded: the result of `model.decode()`, if it is known already.
+            colors: the colours (N, 3) of the model's Gaussians in each view, if they are known: those of the references
+                if only shapes and opacities differ.
         """
 
         def error(index: int, rgb: Tensor) -> float:
             return float((rgb - self.pictures[index]).square().mean())
 
-        return float(np.median(_map_renders(model, self.views, decoded, error)))
+        return float(np.median(_map_renders(model, self.views, decoded, colors, error)))
 
 
-@torch.no_grad()
 def _map_renders(
-    model: HybridModel, cameras: Sequence[Camera], decoded: Decoded | None, function: Callable[[int, Tensor], T]
+    model: HybridModel,
+    cameras: Sequence[Camera],
+    decoded: Decoded | None,
+    colors: Sequence[Tensor] | None,
+    function: Callable[[int, Tensor], T],
 ) -> list[T]:
     """Render a model at cameras and return the function of each camera's index and render, (H, W, 3) in [0, 1]."""
-    decoded = decoded or model.decode()
+    all_views = model.decode() if decoded is None else decoded
 
-    @torch.no_grad()  # gradient mode is kept per thread
     def render(index: int) -> T:
-        return function(index, render_view(model, cameras[index], decoded=decoded).rgb)
+        one_view = all_views if colors is None else replace(all_views, colors=colors[index])
+        return function(index, render_view(model, cameras[index], decoded=one_view).rgb)
 
-    return parallel_map(render, range(len(cameras)), model.gaussians.positions.device)
+    return _map_views(model, render, len(cameras))
+
+
+def _map_views(model: HybridModel, function: Callable[[int], T], count: int) -> list[T]:
+    """Return the function of each view's index, called without gradients on the threads of the pool."""
+    call = torch.no_grad()(function)  # Gradient mode is kept per thread.
+    return parallel_map(call, range(count), model.gaussians.positions.device)

@@ -49,19 +49,26 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Decoded:
-    """The view-independent part of a model's evaluation, which can be reused for many views.
+    """The part of a model's evaluation that can be reused: for many views, or with colours for one view.
 
     Attributes:
         geometry: geometry of all Gaussians.
         shading: the position-dependent part of the colour decoder's first layer for all Gaussians, and the remaining
             layers; None if it would save no time.
+        colors: (N, 3) the colours of all Gaussians in view of the one camera that is rendered, see `colors_in_view`.
+            None if they are computed for each view.
     """
 
     geometry: Geometry
     shading: Shading | None
+    colors: Tensor | None = None
 
     def __getitem__(self, index: Tensor) -> Decoded:
-        return Decoded(self.geometry[index], None if self.shading is None else self.shading.subset(index))
+        return Decoded(
+            self.geometry[index],
+            None if self.shading is None else self.shading.subset(index),
+            None if self.colors is None else self.colors[index],
+        )
 
 
 def scale_bounds(positions: Tensor, config: ModelConfig) -> Tensor:

@@ -276,15 +276,16 @@ def _select_gaussians(
     With a reserve, also the number of indices in use and what the reserve must have, as `frustum_cull_into` returns
     them; otherwise None, None.
 
-    With precomputed shading and without colour residuals, `rasterize` gets all Gaussians and culls them itself.
-    Otherwise only those in view are shaded.
+    With precomputed shading and without colours or colour residuals, `rasterize` gets all Gaussians and culls them
+    itself. Otherwise only those in view are shaded.
 
     Raises:
         FloatingPointError: a position is NaN or infinite.
     """
     positions = model.gaussians.positions
-    shading = None if decoded is None else decoded.shading
-    if decoded is not None and shading is not None and model.gaussians.color_residuals is None:
+    shading, known_colors = (None, None) if decoded is None else (decoded.shading, decoded.colors)
+    has_residuals = model.gaussians.color_residuals is not None
+    if decoded is not None and shading is not None and known_colors is None and not has_residuals:
         return torch.arange(len(model), device=positions.device), decoded.geometry.at(positions), shading, None, None
     used, demand = None, None
     with add_seconds(seconds, "cull"), torch.no_grad():
@@ -295,8 +296,10 @@ def _select_gaussians(
             index, used, demand = frustum_cull_into(*frustum, reserve.gaussians)
     with add_seconds(seconds, "decode"):
         geometry = model.decode_geometry(index, used) if decoded is None else decoded.geometry[index]
-        viewpoint = _viewpoint(viewport, positions)
-        colors = model.decode_colors(viewpoint, index, shading, used)
+        if known_colors is None:
+            colors = model.decode_colors(_viewpoint(viewport, positions), index, shading, used)
+        else:
+            colors = known_colors[index]
         return index, geometry.at(take_rows(positions, index, used)), colors, used, demand
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,13 @@ from scenes import ball_points, ring, small_model
 
 from hyrfpack.compress.calibrate import MAX_CORRECTION_ROUNDS, calibrate
 from hyrfpack.compress.correction import PREDICTION_TOLERANCE_RATIO, CorrectionFactor
-from hyrfpack.compress.part_errors import QUANTIZED_PARTS, predict_errors, update_decoded
+from hyrfpack.compress.part_errors import (
+    COLOR_SECTIONS,
+    QUANTIZED_PARTS,
+    predict_errors,
+    subset_decoded,
+    update_decoded,
+)
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import plan_and_quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
@@ -117,7 +124,7 @@ def test_a_single_outlier_view_does_not_affect_the_measured_error(model):
     references = ReferenceRenders.from_model(model, CALIBRATION_CAMERAS)
     broken = [torch.ones_like(picture) if n == 0 else picture for n, picture in enumerate(references.pictures)]
 
-    assert ReferenceRenders(references.views, broken).measure_error(model) == 0.0
+    assert replace(references, pictures=broken).measure_error(model) == 0.0
 
 
 def test_sensitivities_of_invisible_gaussians_stay_negligible():
@@ -186,9 +193,24 @@ def test_updating_changed_parts_equals_decoding_the_whole_model(part, decoder_sc
     other = {name: arrays[name] * generator.uniform(0.5, 1.5, arrays[name].shape).astype(np.float32) for name in part}
     changed.load_state_dict(dict(iter_parameters(other, changed)), strict=False)
 
-    measured = ReferenceRenders.from_model(before, CALIBRATION_CAMERAS).measure_error(
-        changed, update_decoded(changed, before.decode(), part)
-    )
+    references, decoded = ReferenceRenders.from_model(before, CALIBRATION_CAMERAS), before.decode()
+    measured = [references.measure_error(changed, update_decoded(changed, decoded, part))]
+    if not COLOR_SECTIONS.intersection(part):
+        measured += [references.measure_error(changed, update_decoded(changed, decoded, part), references.colors)]
 
-    expected = ReferenceRenders.from_model(before, CALIBRATION_CAMERAS).measure_error(changed)
-    assert measured == pytest.approx(expected, rel=1e-3) and (expected > 1e-7 or not decoder_scale)
+    expected = references.measure_error(changed)
+    assert measured == pytest.approx([expected] * len(measured), rel=1e-3) and (expected > 1e-7 or not decoder_scale)
+
+
+def test_renders_of_some_gaussians_use_the_colours_of_all(model):
+    references, kept = ReferenceRenders.from_model(model, CALIBRATION_CAMERAS), np.arange(0, len(model), 3)
+    some, decoded = subset_decoded(model, model.decode(), kept)
+
+    reused = ReferenceRenders.from_views(references.views, some, decoded, references.colors_of(kept))
+
+    fresh = ReferenceRenders.from_views(references.views, some)
+    for ours, expected in zip(reused.pictures, fresh.pictures, strict=True):
+        torch.testing.assert_close(ours, expected, rtol=0, atol=1e-6)
+    expected_error = references.measure_error(some)
+    assert expected_error > 1e-5
+    assert references.measure_error(some, decoded, references.colors_of(kept)) == pytest.approx(expected_error)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from hyrfpack.model import Frame
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.background import BACKGROUND_RADIUS, reference
 from hyrfpack.render import RenderSettings, render_view
+from hyrfpack.render.in_view import colors_in_view, gaussians_in_view
 from hyrfpack.scene import Camera
+from tools.safety.make_golden import add_golden_residuals
 
 WORLD_FRAME = Frame((10.0, -20.0, 5.0), 7.0, (1.0, 0.5, 0.5))
 EXACT_SETTINGS = RenderSettings(background_threshold=0.0, background_stride=1)
@@ -328,6 +331,25 @@ def test_a_model_decoded_beforehand_gives_the_same_picture():
         torch.testing.assert_close(
             render_rgb(model, camera, decoded=decoded), render_rgb(model, camera), rtol=0, atol=1e-6
         )
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_known_colours_give_the_same_picture(degree):
+    model = ball_model(frame=WORLD_FRAME)
+    model = add_golden_residuals(model, degree) if degree else model
+    camera = off_centre_camera((0.1, -0.9, 0.2))  # near enough that some Gaussians are out of view
+    decoded = model.decode()
+
+    colors = colors_in_view(model, camera, decoded)
+
+    index = gaussians_in_view(model, camera)
+    assert colors.shape == (len(model), 3) and 0 < len(index) < len(model)
+    assert (colors[index] > 0).any(dim=1).all() and int((colors > 0).any(dim=1).sum()) == len(index)
+    picture = render_rgb(model, camera, decoded=replace(decoded, colors=colors))
+    torch.testing.assert_close(picture, render_rgb(model, camera, decoded=decoded), rtol=0, atol=1e-6)
+    half = torch.arange(0, len(model), 2)
+    picture = render_rgb(model.subset(half), camera, decoded=replace(decoded, colors=colors)[half])
+    torch.testing.assert_close(picture, render_rgb(model.subset(half), camera), rtol=0, atol=1e-6)
 
 
 def test_rendering_twice_gives_the_same_bits():
