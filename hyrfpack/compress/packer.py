@@ -20,7 +20,7 @@ from hyrfpack.compress.limits import (
 )
 from hyrfpack.compress.part_errors import predict_errors
 from hyrfpack.compress.plan import make_plan
-from hyrfpack.compress.quantize import quantize
+from hyrfpack.compress.quantize import field_opacity_logits, quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
@@ -95,10 +95,11 @@ class Packer:
             planned = plan.apply(model)
         progress(TaskEvent("quantising", 0.9 if steps else 0.1))
         reach = 0 if steps else 1
-        quantized = quantize(planned, plan, self.sensitivity, reach=reach)
+        field_logits = field_opacity_logits(planned)
+        quantized = quantize(planned, plan, self.sensitivity, reach=reach, field_logits=field_logits)
         progress(TaskEvent("entropy coding", 0.95 if steps else 0.6))
         data = encode_model(planned, "compact", self.provenance, quantized=quantized)
-        return EncodedCandidate(data, predict_errors(planned, quantized, self.sensitivity))
+        return EncodedCandidate(data, predict_errors(planned, quantized, self.sensitivity, field_logits))
 
     def encode_to_distortion(
         self, target: float, references: ReferenceRenders, target_drop: float | None = None

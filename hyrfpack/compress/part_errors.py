@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from hyrfpack.compress.plan import distortion_per_number, indices_to_keep, make_plan
-from hyrfpack.compress.quantize import opacity_error_model, quantize
+from hyrfpack.compress.quantize import field_opacity_logits, opacity_error_model, quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.residuals import residual_sensitivity
 from hyrfpack.compress.sensitivity import PRUNED_KEY, Sensitivity
@@ -124,8 +124,9 @@ class QuantizationErrors:
     references: ReferenceRenders
     distortion: float
     prune: bool
-    # The sensitivities of positions that the last plan was made for, the plan, and the planned model.
-    _last_plan: tuple[np.ndarray, Plan, HybridModel] | None = field(default=None, init=False)
+    # The sensitivities of positions that the last plan was made for; the plan; the planned model and its
+    # `field_opacity_logits`.
+    _last_plan: tuple[np.ndarray, Plan, HybridModel, np.ndarray] | None = field(default=None, init=False)
     parts: tuple[Part, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -134,10 +135,10 @@ class QuantizationErrors:
 
     def measure(self, sensitivity: Sensitivity, parts: list[Part], progress: Progress) -> dict[Part, ErrorMeasurement]:
         """Quantise all of `parts` and measure the error of each one alone, see `PartErrors.measure`."""
-        plan, planned = self._plan(sensitivity)
+        plan, planned, field_logits = self._plan(sensitivity)
         names = [name for part in parts for name in part]
-        quantized = quantize(planned, plan, sensitivity, sections=names)
-        predicted = _predict_quantization_errors(planned, quantized, sensitivity)
+        quantized = quantize(planned, plan, sensitivity, sections=names, field_logits=field_logits)
+        predicted = _predict_quantization_errors(planned, quantized, sensitivity, field_logits)
         arrays = _undo_plan_order(quantized)
         errors = {}
         for number, part in enumerate(parts):
@@ -147,11 +148,15 @@ class QuantizationErrors:
             errors[part] = ErrorMeasurement(measured, sum(predicted[name] for name in part))
         return errors
 
-    def _plan(self, sensitivity: Sensitivity) -> tuple[Plan, HybridModel]:
-        """Return a plan and the planned model; they are made again only if the sensitivities of positions changed."""
+    def _plan(self, sensitivity: Sensitivity) -> tuple[Plan, HybridModel, np.ndarray]:
+        """Return a plan, the planned model and its `field_opacity_logits`.
+
+        They are made again only if the sensitivities of positions changed.
+        """
         if self._last_plan is None or not np.array_equal(self._last_plan[0], sensitivity.positions):
             plan = make_plan(self.model, sensitivity, self.distortion, self.prune)
-            self._last_plan = sensitivity.positions, plan, plan.apply(self.model)
+            planned = plan.apply(self.model)
+            self._last_plan = sensitivity.positions, plan, planned, field_opacity_logits(planned)
         return self._last_plan[1:]
 
     def _measure_part(self, part: Part, planned: HybridModel, arrays: dict[str, np.ndarray]) -> float:
@@ -169,14 +174,23 @@ def subset_decoded(model: HybridModel, decoded: Decoded, kept: np.ndarray) -> tu
     return model.subset(index), decoded[index]
 
 
-def predict_errors(planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity) -> dict[str, float]:
-    """Predict the mean squared error that compression adds to pictures, for each section and for PRUNED_KEY."""
-    removed = np.delete(sensitivity.removals, quantized.plan.kept)
-    return {PRUNED_KEY: float(removed.sum()), **_predict_quantization_errors(planned, quantized, sensitivity)}
+def predict_errors(
+    planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity, field_logits: np.ndarray
+) -> dict[str, float]:
+    """Predict the mean squared error that compression adds to pictures, for each section and for PRUNED_KEY.
+
+    Args:
+        planned: the planned model.
+        quantized: the result of `quantize`.
+        sensitivity: the sensitivities of the model before pruning.
+        field_logits: the result of `field_opacity_logits(planned)`.
+    """
+    removed = float(np.delete(sensitivity.removals, quantized.plan.kept).sum())
+    return {PRUNED_KEY: removed, **_predict_quantization_errors(planned, quantized, sensitivity, field_logits)}
 
 
 def _predict_quantization_errors(
-    planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity
+    planned: HybridModel, quantized: QuantizedModel, sensitivity: Sensitivity, field_logits: np.ndarray
 ) -> dict[str, float]:
     """Predict the mean squared error that each quantised section and the positions add to pictures."""
     plan = quantized.plan
@@ -189,7 +203,7 @@ def _predict_quantization_errors(
     errors = {POSITIONS: float((s.positions * 3 / 12 * 4.0**-bits).sum())}
     for group, values in stored.items():
         if group == OPACITIES:
-            _, error = opacity_error_model(planned, wanted[group][:, 0].astype(np.float64), s.opacities)
+            _, error = opacity_error_model(field_logits, wanted[group][:, 0].astype(np.float64), s.opacities)
             errors[group] = float(error(slice(None), values[:, 0]).sum())
         else:
             difference = values.ravel().astype(np.float64) - wanted[group].ravel()

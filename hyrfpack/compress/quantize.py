@@ -54,6 +54,7 @@ def quantize(
     reach: int = 1,
     previous: QuantizedModel | None = None,
     sections: Collection[str] = (*LOGIT_SECTIONS, *RESIDUAL_SECTIONS, *TABLE_SECTIONS, *DECODER_SECTIONS),
+    field_logits: np.ndarray | None = None,
 ) -> QuantizedModel:
     """Quantise a planned model (`plan.apply`) by rate and distortion.
 
@@ -64,6 +65,7 @@ def quantize(
         reach: distance in steps of the furthest candidate from the nearest symbol; 0 takes the nearest.
         previous: an earlier result for the same plan, whose prediction weights are reused.
         sections: the sections to quantise; a file needs all of them.
+        field_logits: result of `field_opacity_logits(model)`, if it is known.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
@@ -86,7 +88,8 @@ def quantize(
             arrays[COLORS], -MAX_ABS_CHANNEL_VALUE / 2, MAX_ABS_CHANNEL_VALUE / 2
         ) @ plan.basis.astype(np.float64)
     if OPACITIES in logits:
-        numbers, error = opacity_error_model(model, arrays[OPACITIES][:, 0], sensitivity.opacities)
+        field_logits = field_opacity_logits(model) if field_logits is None else field_logits
+        numbers, error = opacity_error_model(field_logits, arrays[OPACITIES][:, 0], sensitivity.opacities)
         arrays[OPACITIES] = numbers[:, None]
     stop = 0
     for layer, classes in enumerate(layer.points.classes for layer in plan.layers):
@@ -127,24 +130,28 @@ def _offset_error(error: ErrorModel, start: int, places: Any, candidates: np.nda
 
 
 @torch.no_grad()
+def field_opacity_logits(model: HybridModel) -> np.ndarray:
+    """Return what the geometry field adds to the explicit opacity logits of a model, (M,) float64."""
+    return model.geometry(model.cube_coords(model.gaussians.positions))[:, 0].double().cpu().numpy()
+
+
 def opacity_error_model(
-    model: HybridModel, logits: np.ndarray, sensitivity: np.ndarray
+    field_logits: np.ndarray, logits: np.ndarray, sensitivity: np.ndarray
 ) -> tuple[np.ndarray, ErrorModel]:
     """Clamp opacity logits (M,) where the opacity is saturated, and return an error model that works on opacities.
 
     Args:
-        model: the planned model, whose geometry field adds to the explicit logits.
+        field_logits: (M,) what the geometry field of the planned model adds, see `field_opacity_logits`.
         logits: (M,) explicit opacity logits.
         sensitivity: (M,) sensitivities of the explicit opacity logits.
 
     Returns:
         (M,) clamped logits; and the model that maps (places, candidate logits) to errors.
     """
-    neural = model.geometry(model.cube_coords(model.gaussians.positions))[:, 0].double().cpu().numpy()
-    opacities = expit(neural + logits)
+    opacities = expit(field_logits + logits)
     weights = sensitivity / np.maximum(opacities * (1 - opacities), 1e-4) ** 2
 
     def error(places: Any, candidates: np.ndarray) -> np.ndarray:
-        return weights[places] * (expit(neural[places] + candidates) - opacities[places]) ** 2
+        return weights[places] * (expit(field_logits[places] + candidates) - opacities[places]) ** 2
 
-    return np.clip(logits, -SATURATION_LOGIT - neural, SATURATION_LOGIT - neural), error
+    return np.clip(logits, -SATURATION_LOGIT - field_logits, SATURATION_LOGIT - field_logits), error

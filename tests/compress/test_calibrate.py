@@ -20,7 +20,7 @@ from hyrfpack.compress.part_errors import (
     update_decoded,
 )
 from hyrfpack.compress.plan import make_plan
-from hyrfpack.compress.quantize import plan_and_quantize
+from hyrfpack.compress.quantize import field_opacity_logits, plan_and_quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.sensitivity import PRUNED_KEY, Sensitivity, measure_sensitivity
 from hyrfpack.format import decode_model, encode_model
@@ -49,7 +49,8 @@ def predict_and_measure_error(model: HybridModel, sensitivity: Sensitivity, dist
     """Return the predicted error of a packed file, and the error measured at held-out viewpoints."""
     quantized = plan_and_quantize(model, sensitivity, distortion)
     decoded = decode_model(encode_model(model, "compact", quantized=quantized))
-    predicted = predict_errors(quantized.plan.apply(model), quantized, sensitivity)
+    planned = quantized.plan.apply(model)
+    predicted = predict_errors(planned, quantized, sensitivity, field_opacity_logits(planned))
     return sum(predicted.values()), ReferenceRenders.from_model(model, HELD_OUT_CAMERAS).measure_error(decoded)
 
 
