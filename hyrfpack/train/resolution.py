@@ -33,13 +33,14 @@ COST_SAMPLE_COUNT = 100
 # A training step evaluates the background at about this many pixels at most, and at every second one of small photos.
 MAX_BACKGROUND_NODES = 40_000
 MIN_BACKGROUND_STRIDE = 2
+COARSE_BACKGROUND_STRIDE = 3  # the smallest stride for unreduced photos before FULL_RESOLUTION_START
 
 
 class ResolutionSchedule:
-    """The factor, a power of two, by which each step reduces width and height of its photo.
+    """The factor, a power of two, by which each step reduces width and height of its photo; the background's stride.
 
-    It depends on the number of Gaussians after each round of density control. A change takes effect a few steps later,
-    because photos are read in advance. So a resumed run takes the same steps as an uninterrupted one.
+    The factor depends on the number of Gaussians after each round of density control. A change takes effect a few steps
+    later, because photos are read in advance. So a resumed run takes the same steps as an uninterrupted one.
 
     Attributes:
         changes: the first step, from 1, and the factor of each part of the run before the steps at full resolution.
@@ -54,6 +55,7 @@ class ResolutionSchedule:
             gaussians: number of Gaussians at the start.
             is_on: False for steps that are all at full resolution.
         """
+        self._is_on = is_on
         self._size = PhotoSize.of_views(views)
         self._steps, self._last_coarse_step = steps, int(FULL_RESOLUTION_START * steps)
         self.changes = [(1, self._size.reduction_for(gaussians) if is_on else 1)]
@@ -96,9 +98,14 @@ class ResolutionSchedule:
         """
         return RenderSettings(
             exposure=CONSISTENT_EXPOSURE,  # Training applies the gains of the photo itself.
-            background_stride=background_stride(camera),
+            background_stride=max(background_stride(camera), self._min_background_stride(step)),
             low_pass_variance=reduced_low_pass_variance(self.factor(step)),
         )
+
+    def _min_background_stride(self, step: int) -> int:
+        """Return the smallest stride of a step, counted from 1."""
+        is_coarse = self._is_on and step <= self._last_coarse_step and self.factor(step) == 1
+        return COARSE_BACKGROUND_STRIDE if is_coarse else MIN_BACKGROUND_STRIDE
 
     def describe(self) -> str:
         """Return in words what was reduced; empty if nothing was."""
@@ -164,5 +171,5 @@ def reduced_low_pass_variance(factor: int) -> float:
 
 
 def background_stride(camera: Camera) -> int:
-    """Return the stride at which a training step evaluates the background."""
+    """Return the stride at which the last training steps evaluate the background."""
     return max(MIN_BACKGROUND_STRIDE, math.ceil(math.sqrt(camera.width * camera.height / MAX_BACKGROUND_NODES)))

@@ -155,6 +155,25 @@ def test_large_steps_evaluate_the_background_at_few_pixels() -> None:
     assert background_stride(make_view(400, 266).camera) == resolution.MIN_BACKGROUND_STRIDE
 
 
+@pytest.mark.parametrize(("is_on", "coarse"), [(True, resolution.COARSE_BACKGROUND_STRIDE), (False, 2)])
+def test_the_last_steps_evaluate_the_background_at_more_pixels(is_on: bool, coarse: int) -> None:
+    small, large = (make_view(*size) for size in ((400, 266), (1600, 1066)))
+    schedule = ResolutionSchedule([small, large], 1000, 60_000, is_on=is_on)
+    last_coarse_step = int(resolution.FULL_RESOLUTION_START * 1000)
+
+    for view, first, last in ((small, coarse, 2), (large, 7, 7)):
+        strides = [schedule.render_settings(view.camera, step).background_stride for step in range(1, 1001)]
+        assert strides == [first] * last_coarse_step + [last] * (1000 - last_coarse_step)
+
+
+def test_reduced_photos_keep_the_stride_of_the_background() -> None:
+    large = make_view(1600, 1066)
+    schedule = ResolutionSchedule([large], 1000, 2_000)
+    assert schedule.factor(1) == 4
+    camera = schedule.reduce_view(large, 1).camera
+    assert schedule.render_settings(camera, 1).background_stride == background_stride(camera) == 2
+
+
 def make_large_scene() -> Scene:
     side = 2 * resolution.MIN_REDUCED_SIDE_PIXELS
     views = [make_view(side, side, f"{number}.png", distance=3 + number / 10) for number in range(4)]
