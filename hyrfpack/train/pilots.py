@@ -13,6 +13,7 @@ import torch
 
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
+from hyrfpack.data.reduced import reduce_view
 from hyrfpack.evaluate import Evaluation, evaluate_model
 from hyrfpack.progress import Progress, StepEvent, TaskEvent, ignore_progress, items_of_progress
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
@@ -107,23 +108,32 @@ class ScenePilots:
         self.scores: list[PilotScore] = []
         self.steps = 0
 
-    def fold(self, every: int | None = None, max_validation: int = MAX_VALIDATION_VIEWS, number: int = 0) -> Fold:
+    def fold(
+        self,
+        every: int | None = None,
+        max_validation: int = MAX_VALIDATION_VIEWS,
+        number: int = 0,
+        reduction: int = 1,
+    ) -> Fold:
         """Split the training photos, and read the validation photos.
 
         Args:
             every, max_validation, number: see `split`.
+            reduction: factor by which width and height of all photos are reduced. The budget falls by its square.
 
         Raises:
             HyrfError: a photo cannot be read.
         """
         training, views = split(self.scene.train, every, max_validation, number)
         validation: list[View] = []
-        for done, view in enumerate(views):
+        for done, view in enumerate(reduce_view(view, reduction) for view in views):
             self._progress(TaskEvent("reading validation photos", done=done, total=len(views)))
             if is_usable(self.cache.get(view)):
                 validation.append(view)
         scene = dataclasses.replace(self.scene, train=training, test=[])
-        return Fold(scene, validation, budget_for(scene, TrainConfig(steps=BUDGET_REFERENCE_STEPS))[0])
+        budget, _ = budget_for(scene, TrainConfig(steps=BUDGET_REFERENCE_STEPS))
+        scene = dataclasses.replace(scene, train=[reduce_view(view, reduction) for view in training])
+        return Fold(scene, validation, round(budget / reduction**2))
 
     def run(
         self,

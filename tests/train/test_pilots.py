@@ -373,6 +373,27 @@ def test_too_few_unmasked_validation_photos_decide_nothing(scores, monkeypatch, 
     assert decision is False and f"{left} " in reason and "validation photos" in reason
 
 
+@pytest.mark.parametrize(("side", "trained_side"), [(127, 127), (128, 64), (131, 65)])
+def test_exposure_pilots_train_on_photos_of_half_the_size_and_a_quarter_of_the_gaussians(
+    scores, monkeypatch, side, trained_side
+):
+    monkeypatch.setattr(exposure_pilots, "estimate_exposure_spread", lambda *_: 0.3)
+    scores |= {False: [20.0] * 2, True: [20.3] * 2, "apart": (0.0,) * 6}
+    folds: list[pilots.Fold] = []
+    fold = ScenePilots.fold
+    monkeypatch.setattr(ScenePilots, "fold", lambda *arguments: folds.append(fold(*arguments)) or folds[-1])
+    scene = ball_scene(views=24, points=60, side=side)
+    runs = ScenePilots(scene, LONG_CONFIG, PictureCache(), CPU_DEVICE)
+
+    measure_exposure(runs)
+
+    sizes = {(view.camera.width, view.camera.height) for view in (*folds[0].scene.train, *folds[0].validation)}
+    assert sizes == {(trained_side, trained_side)}
+    assert {view.load().rgb.shape for view in folds[0].validation} == {(trained_side, trained_side, 3)}
+    reduction = side // trained_side
+    assert reduction**2 * folds[0].max_gaussians == pytest.approx(fold(runs, 4, 16).max_gaussians, abs=4)
+
+
 def test_photos_of_one_exposure_need_no_pilots(monkeypatch):
     monkeypatch.setattr(exposure_pilots, "estimate_exposure_spread", lambda *_: 0.04)
     runs = ScenePilots(make_scene(20), LONG_CONFIG, PictureCache(), CPU_DEVICE)
