@@ -33,7 +33,9 @@ COST_SAMPLE_COUNT = 100
 # A training step evaluates the background at about this many pixels at most, and at every second one of small photos.
 MAX_BACKGROUND_NODES = 40_000
 MIN_BACKGROUND_STRIDE = 2
-COARSE_BACKGROUND_STRIDE = 3  # the smallest stride for unreduced photos before FULL_RESOLUTION_START
+# The smallest stride for unreduced photos before FULL_RESOLUTION_START, unless their shorter side is below the limit.
+COARSE_BACKGROUND_STRIDE = 3
+MIN_COARSE_BACKGROUND_SIDE_PIXELS = 128
 
 
 class ResolutionSchedule:
@@ -98,13 +100,14 @@ class ResolutionSchedule:
         """
         return RenderSettings(
             exposure=CONSISTENT_EXPOSURE,  # Training applies the gains of the photo itself.
-            background_stride=max(background_stride(camera), self._min_background_stride(step)),
+            background_stride=max(background_stride(camera), self._min_background_stride(camera, step)),
             low_pass_variance=reduced_low_pass_variance(self.factor(step)),
         )
 
-    def _min_background_stride(self, step: int) -> int:
-        """Return the smallest stride of a step, counted from 1."""
-        is_coarse = self._is_on and step <= self._last_coarse_step and self.factor(step) == 1
+    def _min_background_stride(self, camera: Camera, step: int) -> int:
+        """Return the smallest stride for a camera at the resolution of a step, counted from 1."""
+        is_small = min(camera.width, camera.height) < MIN_COARSE_BACKGROUND_SIDE_PIXELS
+        is_coarse = self._is_on and step <= self._last_coarse_step and self.factor(step) == 1 and not is_small
         return COARSE_BACKGROUND_STRIDE if is_coarse else MIN_BACKGROUND_STRIDE
 
     def describe(self) -> str:

@@ -157,11 +157,11 @@ def test_large_steps_evaluate_the_background_at_few_pixels() -> None:
 
 @pytest.mark.parametrize(("is_on", "coarse"), [(True, resolution.COARSE_BACKGROUND_STRIDE), (False, 2)])
 def test_the_last_steps_evaluate_the_background_at_more_pixels(is_on: bool, coarse: int) -> None:
-    small, large = (make_view(*size) for size in ((400, 266), (1600, 1066)))
-    schedule = ResolutionSchedule([small, large], 1000, 60_000, is_on=is_on)
+    tiny, small, large = (make_view(*size) for size in ((127, 150), (400, 266), (1600, 1066)))
+    schedule = ResolutionSchedule([tiny, small, large], 1000, 60_000, is_on=is_on)
     last_coarse_step = int(resolution.FULL_RESOLUTION_START * 1000)
 
-    for view, first, last in ((small, coarse, 2), (large, 7, 7)):
+    for view, first, last in ((tiny, 2, 2), (small, coarse, 2), (large, 7, 7)):
         strides = [schedule.render_settings(view.camera, step).background_stride for step in range(1, 1001)]
         assert strides == [first] * last_coarse_step + [last] * (1000 - last_coarse_step)
 
