@@ -14,6 +14,7 @@ multiplied by measured over predicted error, repeatedly, until the prediction is
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from hyrfpack.compress.correction import SensitivityCorrection
 from hyrfpack.compress.part_errors import PartErrors, PruningErrors, QuantizationErrors, subset_decoded
@@ -52,7 +53,8 @@ def measure_calibrated_sensitivity(
     progress(TaskEvent("rendering reference views", 0.5))
     references = ReferenceRenders.from_model(model, cameras)
     rest = part_of_progress(progress, 0.55, 1.0)
-    return calibrate(model, sensitivity, references, distortion, prune, rest), references
+    calibrated = calibrate(model, sensitivity, references, distortion, prune, rest)
+    return calibrated, replace(references, colors=[])  # Colours take memory, and only calibration uses them.
 
 
 def calibrate(

@@ -33,7 +33,7 @@ class ReferenceRenders:
     Attributes:
         views: the cameras that were rendered.
         pictures: the render of each view, (H, W, 3) in [0, 1].
-        colors: the colours (N, 3) of the model's Gaussians in each view, see `colors_in_view`.
+        colors: the colours (N, 3) of the model's Gaussians in each view, see `colors_in_view`; empty after calibration.
     """
 
     views: list[Camera]
@@ -57,7 +57,12 @@ class ReferenceRenders:
         decoded: Decoded | None = None,
         colors: list[Tensor] | None = None,
     ) -> ReferenceRenders:
-        """Render a model at the given views; `decoded` and `colors` are as in `measure_error`."""
+        """Render a model at the given views; `decoded` and `colors` are as in `measure_error`.
+
+        Raises:
+            FloatingPointError: a position is NaN or infinite.
+            HyrfError: another number of the model is.
+        """
         decoded = model.decode() if decoded is None else decoded
         if colors is None:
             colors = _map_views(model, lambda index: colors_in_view(model, views[index], decoded), len(views))

@@ -129,8 +129,8 @@ class TrainConfig:
         steps: training steps.
         early_stop: shorten a run of over 3,000 steps on 8 to 30 photos, or of 20,000 or more on up to 100, where pilot
             runs show that more do not help.
-        resolution_schedule: train most steps on reduced photos if photos are large and Gaussians few, and evaluate the
-            background of the others at fewer pixels in these steps.
+        resolution_schedule: in the first 80 % of the steps, reduce photos if they are large and Gaussians few, and
+            evaluate the background of photos that are not reduced at every third pixel.
         seed: random seed. On a CPU, the same seed gives the same file.
         preset: kind of scene; auto detects it.
         max_gaussians: budget: the maximum number of Gaussians. Default: measured by pilot runs.

@@ -86,7 +86,7 @@ def refit(
     frozen = torch.from_numpy(np.flatnonzero(~is_selected))
     originals = [values.detach()[frozen] for values in model.gaussians.parameters()]
     optimizer = Optimizer(trained, rates)
-    resolution = ResolutionSchedule(shown, steps, len(model))
+    resolution = ResolutionSchedule(shown, steps, len(model), has_coarse_background=False)
     order = map(resolution.reduce_view, shuffled(shown, 0, range(steps)), range(1, steps + 1))
     with closing(cache.stream(order)) as pictures, torch_on_one_thread(), freed_memory_kept():
         for step, (view, picture) in enumerate(pictures):

@@ -20,7 +20,6 @@ from hyrfpack.train.decisions import (
     MIN_EXPOSURE_STEPS,
     max_exposure_pilot_steps,
     max_pilot_steps,
-    measures_exposure,
 )
 from hyrfpack.train.length_pilots import max_length_pilot_steps
 from hyrfpack.train.pilots import BUDGET_REFERENCE_STEPS
@@ -31,7 +30,6 @@ from hyrfpack.train.setup import budget_for, estimate_initial_count, usual_budge
 CPU_STEP_SECONDS = 0.03  # time of a training step that does not depend on the photo's size
 CPU_STEP_SECONDS_PER_MEGAPIXEL = 0.2
 GPU_STEP_SECONDS_PER_MEGAPIXEL = 0.02
-EXPOSURE_PILOT_STEP_COST = 1 / 3  # of a step of other pilots, because photos are reduced
 CPU_PASS_SECONDS_PER_MEGAPIXEL = 0.6  # a pass renders a view and back-propagates through it
 BACKGROUND_SEARCH_PASSES = 8.0  # time of the search for a background in unseen directions
 PASSES_PER_SCORED_VIEW = 2.0  # time of scoring a held-out photo and writing its picture
@@ -166,7 +164,7 @@ def estimate_seconds(
         plan: the plan.
         initial, gaussians: expected number of Gaussians at the start and at the end.
         held_out: number of photos that are scored.
-        pilot_steps: number of steps of all pilot runs, on photos of this size.
+        pilot_steps: number of steps of all pilot runs, see `max_pilot_steps`.
         device: device of the training.
 
     Returns:
@@ -200,9 +198,7 @@ def estimate_scene_seconds(scene: Scene, plan: Plan, device: torch.device) -> di
     gaussians, _ = budget_for(scene, config)
     initial = estimate_initial_count(scene, gaussians)
     size = PhotoSize.of_views(scene.train)
-    reduced_steps = max_exposure_pilot_steps(len(scene.train), config.steps) * measures_exposure(scene, config)
-    pilot_steps = max_pilot_steps(scene, config) - (1 - EXPOSURE_PILOT_STEP_COST) * reduced_steps
-    return estimate_seconds(size, plan, initial, gaussians, len(scene.test), pilot_steps, device)
+    return estimate_seconds(size, plan, initial, gaussians, len(scene.test), max_pilot_steps(scene, config), device)
 
 
 def expected_photo_size(size: tuple[int, int] | None, max_size: int) -> PhotoSize:
@@ -215,8 +211,8 @@ def estimate_photos_seconds(count: int, size: PhotoSize, plan: Plan, device: tor
     """Return `estimate_seconds` and the time for poses, for `count` photos of this size."""
     trained = count - count // 8
     gaussians = usual_budget(size.pixels, trained * size.pixels, plan.steps)
-    reduced_steps = max_exposure_pilot_steps(trained, plan.steps) * (plan.steps >= MIN_EXPOSURE_STEPS)
-    pilot_steps = MAX_BUDGET_PILOT_STEPS * (plan.steps >= MIN_BUDGET_STEPS) + EXPOSURE_PILOT_STEP_COST * reduced_steps
+    pilot_steps = max_exposure_pilot_steps(trained, plan.steps) * (plan.steps >= MIN_EXPOSURE_STEPS)
+    pilot_steps += MAX_BUDGET_PILOT_STEPS * (plan.steps >= MIN_BUDGET_STEPS)
     pilot_steps += max_length_pilot_steps(trained, plan.steps) * plan.early_stop
     return {
         "poses": POSE_SECONDS_PER_PHOTO * count,

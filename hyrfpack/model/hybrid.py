@@ -55,8 +55,8 @@ class Decoded:
         geometry: geometry of all Gaussians.
         shading: the position-dependent part of the colour decoder's first layer for all Gaussians, and the remaining
             layers; None if it would save no time.
-        colors: (N, 3) the colours of all Gaussians in view of the one camera that is rendered, see `colors_in_view`.
-            None if they are computed for each view.
+        colors: (N, 3) the colours of all Gaussians in view of the one camera that is rendered, see `colors_in_view`;
+            others are black. None if colours are computed for each view.
     """
 
     geometry: Geometry

@@ -89,7 +89,8 @@ class Rendering:
         alpha: (H, W) coverage by Gaussians, 1 - transmittance.
         depth: (H, W) expected depth along the view axis in world units, 0 where no Gaussian is hit; None unless
             requested.
-        indices: (n,) indices of the Gaussians that were decoded: those in view, or all if `decoded` had their colours.
+        indices: (n,) indices of the Gaussians that were decoded: those in view, or all if `decoded` has their shading and
+            no colours, and the model has no colour residuals.
         visible: (n,) bool, whether each of these touches the image.
         absgrad: (n, 2) sums over pixels of |dL/d mean2d| in 1/px; zero until backward has run; None unless requested.
         pairs: number of blended tile-Gaussian pairs, or of those reserved.
@@ -152,7 +153,8 @@ def render_view(
         camera: the camera, in world units.
         settings: render settings.
         decoded: result of `model.decode()`. It does not depend on the view, so callers who render many views of an
-            unchanged model compute it once. A rendering with `decoded` is not differentiable.
+            unchanged model compute it once. A rendering with `decoded` is not differentiable. With `Decoded.colors`
+            it holds only for the camera of these colours and the default `near` and `cull_tolerance`.
         depth: whether to return depth.
         absgrad: whether to collect absolute gradients of the projected centres during backward.
         solid: (3,) colour behind everything instead of the model's own; for models without a background sphere.

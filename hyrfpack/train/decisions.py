@@ -14,12 +14,13 @@ from hyrfpack.progress import Progress, ignore_progress
 from hyrfpack.scene import Scene
 from hyrfpack.train.budget_pilots import BUDGET_PILOT_STEPS, MAX_BUDGET_ROUNDS, measure_budget
 from hyrfpack.train.exposure_pilots import (
+    EXPOSURE_PILOT_REDUCTION,
     exposure_pilot_steps,
     exposure_rounds,
     measure_exposure,
 )
 from hyrfpack.train.length_pilots import max_length_pilot_steps, measure_length, pilot_lengths
-from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, PilotScore, PilotsStopped, ScenePilots
+from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, PilotScore, PilotsStopped, ScenePilots, step_cost
 from hyrfpack.train.trainer import Trainer
 
 # Shorter runs have no pilots, which would take too large a part of their time.
@@ -78,17 +79,20 @@ def chosen_steps(scene: Scene, config: TrainConfig, steps: object) -> int:
     return steps if could_be_chosen and isinstance(steps, int) else config.steps
 
 
-def max_pilot_steps(scene: Scene, config: TrainConfig) -> int:
-    """Return the most steps that all pilots of a run take."""
+def max_pilot_steps(scene: Scene, config: TrainConfig) -> float:
+    """Return the most steps that all pilots of a run take; on reduced photos a step counts less, see `Fold`."""
     budget = MAX_BUDGET_PILOT_STEPS * measures_budget(scene, config)
     exposure = max_exposure_pilot_steps(len(scene.train), config.steps) * measures_exposure(scene, config)
     length = max_length_pilot_steps(len(scene.train), config.steps) * config.early_stop
     return budget + exposure + length
 
 
-def max_exposure_pilot_steps(count: int, steps: int) -> int:
-    """Return the most steps that the pilots for exposure take before a run of `steps` steps on `count` photos."""
-    return 2 * exposure_rounds(count) * exposure_pilot_steps(steps)
+def max_exposure_pilot_steps(count: int, steps: int) -> float:
+    """Return the most steps that the pilots for exposure take before a run of `steps` steps on `count` photos.
+
+    Steps on reduced photos count less, see `Fold`.
+    """
+    return 2 * exposure_rounds(count) * exposure_pilot_steps(steps) * step_cost(EXPOSURE_PILOT_REDUCTION)
 
 
 def without_pilots(config: TrainConfig) -> Decisions:

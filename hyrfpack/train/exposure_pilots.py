@@ -17,8 +17,8 @@ from hyrfpack.train.pilots import ScenePilots
 EXPOSURE_PILOT_SHARE = 1 / 6
 MIN_EXPOSURE_PILOT_STEPS = 150
 MAX_EXPOSURE_PILOT_STEPS = 500
-# Pilots train on photos of half the width and height and on a quarter of the Gaussians, in a third of the time. Photos
-# with a shorter side below the limit are not reduced.
+# Pilots train on photos of half the width and height and on a quarter of the Gaussians, in a third of the time. If the
+# shorter side of any photo is below the limit, none is reduced.
 EXPOSURE_PILOT_REDUCTION = 2
 MIN_REDUCED_PILOT_SIDE_PIXELS = 128
 # One in this many training photos is a validation photo. Other decisions need fewer validation photos: here the

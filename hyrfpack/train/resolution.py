@@ -30,7 +30,8 @@ FULL_RESOLUTION_START = 0.8  # From this share of the run on, photos are not red
 # Time of a step that does not depend on its pixels, as a share of the time that pixels take at full resolution.
 FIXED_STEP_COST = 0.05
 COST_SAMPLE_COUNT = 100
-# A training step evaluates the background at about this many pixels at most, and at every second one of small photos.
+# The last training steps evaluate the background at about this many pixels at most, and at every second one of small
+# photos.
 MAX_BACKGROUND_NODES = 40_000
 MIN_BACKGROUND_STRIDE = 2
 # The smallest stride for unreduced photos before FULL_RESOLUTION_START, unless their shorter side is below the limit.
@@ -48,7 +49,15 @@ class ResolutionSchedule:
         changes: the first step, from 1, and the factor of each part of the run before the steps at full resolution.
     """
 
-    def __init__(self, views: Sequence[View], steps: int, gaussians: int, *, is_on: bool = True) -> None:
+    def __init__(
+        self,
+        views: Sequence[View],
+        steps: int,
+        gaussians: int,
+        *,
+        is_on: bool = True,
+        has_coarse_background: bool = True,
+    ) -> None:
         """Begin a run.
 
         Args:
@@ -56,8 +65,9 @@ class ResolutionSchedule:
             steps: number of optimiser steps.
             gaussians: number of Gaussians at the start.
             is_on: False for steps that are all at full resolution.
+            has_coarse_background: use `COARSE_BACKGROUND_STRIDE`, if the schedule is on.
         """
-        self._is_on = is_on
+        self._has_coarse_background = is_on and has_coarse_background
         self._size = PhotoSize.of_views(views)
         self._steps, self._last_coarse_step = steps, int(FULL_RESOLUTION_START * steps)
         self.changes = [(1, self._size.reduction_for(gaussians) if is_on else 1)]
@@ -107,7 +117,9 @@ class ResolutionSchedule:
     def _min_background_stride(self, camera: Camera, step: int) -> int:
         """Return the smallest stride for a camera at the resolution of a step, counted from 1."""
         is_small = min(camera.width, camera.height) < MIN_COARSE_BACKGROUND_SIDE_PIXELS
-        is_coarse = self._is_on and step <= self._last_coarse_step and self.factor(step) == 1 and not is_small
+        is_coarse = (
+            self._has_coarse_background and step <= self._last_coarse_step and self.factor(step) == 1 and not is_small
+        )
         return COARSE_BACKGROUND_STRIDE if is_coarse else MIN_BACKGROUND_STRIDE
 
     def describe(self) -> str:

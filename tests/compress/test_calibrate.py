@@ -215,3 +215,5 @@ def test_renders_of_some_gaussians_use_the_colours_of_all(model):
     expected_error = references.measure_error(some)
     assert expected_error > 1e-5
     assert references.measure_error(some, decoded, references.colors_of(kept)) == pytest.approx(expected_error)
+    black = [torch.zeros_like(colors) for colors in references.colors_of(kept)]
+    assert references.measure_error(some, decoded, black) > 2 * expected_error

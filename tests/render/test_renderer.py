@@ -347,6 +347,8 @@ def test_known_colours_give_the_same_picture(degree):
     assert (colors[index] > 0).any(dim=1).all() and int((colors > 0).any(dim=1).sum()) == len(index)
     picture = render_rgb(model, camera, decoded=replace(decoded, colors=colors))
     torch.testing.assert_close(picture, render_rgb(model, camera, decoded=decoded), rtol=0, atol=1e-6)
+    black = render_rgb(model, camera, decoded=replace(decoded, colors=torch.zeros_like(colors)))
+    assert float((picture - black).abs().max()) > 0.1
     half = torch.arange(0, len(model), 2)
     picture = render_rgb(model.subset(half), camera, decoded=replace(decoded, colors=colors)[half])
     torch.testing.assert_close(picture, render_rgb(model.subset(half), camera), rtol=0, atol=1e-6)

@@ -19,13 +19,13 @@ _kernel = compiled(fastmath={"contract", "nsz"}, error_model="numpy")
 
 @_kernel
 def _list_inside(start, stop, positions, axes, shift, lens, index):
-    """Write the positions start to stop that lie inside to index[start:], ascending, and return their number.
+    """Write which of the positions start to stop lie inside the frustum to index[start:], and return their number.
 
     Args:
         positions: (N, 3) float32 world units.
         axes, shift: rotation (3 x 3) and translation (3) of the pose; float64.
         lens: near plane, fx and fy, then the smallest and largest fx x / z and fy y / z; float64.
-        index: (N,) int64.
+        index: (N,) int64, gets ascending rows of `positions`.
 
     Returns:
         The number of indices, or -1 if a position is NaN or infinite.
