@@ -89,8 +89,8 @@ class Rendering:
         alpha: (H, W) coverage by Gaussians, 1 - transmittance.
         depth: (H, W) expected depth along the view axis in world units, 0 where no Gaussian is hit; None unless
             requested.
-        indices: (n,) indices of the Gaussians that were decoded: those in view, or all if `decoded` has their shading and
-            no colours, and the model has no colour residuals.
+        indices: (n,) indices of the Gaussians that were decoded: those in view, or all if `decoded` has a shading
+            but no colours, and the model has no colour residuals.
         visible: (n,) bool, whether each of these touches the image.
         absgrad: (n, 2) sums over pixels of |dL/d mean2d| in 1/px; zero until backward has run; None unless requested.
         pairs: number of blended tile-Gaussian pairs, or of those reserved.

@@ -116,10 +116,9 @@ class ResolutionSchedule:
 
     def _min_background_stride(self, camera: Camera, step: int) -> int:
         """Return the smallest stride for a camera at the resolution of a step, counted from 1."""
-        is_small = min(camera.width, camera.height) < MIN_COARSE_BACKGROUND_SIDE_PIXELS
-        is_coarse = (
-            self._has_coarse_background and step <= self._last_coarse_step and self.factor(step) == 1 and not is_small
-        )
+        is_large = min(camera.width, camera.height) >= MIN_COARSE_BACKGROUND_SIDE_PIXELS
+        is_early = step <= self._last_coarse_step
+        is_coarse = self._has_coarse_background and is_early and is_large and self.factor(step) == 1
         return COARSE_BACKGROUND_STRIDE if is_coarse else MIN_BACKGROUND_STRIDE
 
     def describe(self) -> str:
