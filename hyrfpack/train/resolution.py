@@ -40,7 +40,7 @@ MIN_COARSE_BACKGROUND_SIDE_PIXELS = 128
 
 
 class ResolutionSchedule:
-    """The factor, a power of two, by which each step reduces width and height of its photo; the background's stride.
+    """The reduction of each step's photo, a factor that is a power of two, and the stride of its background.
 
     The factor depends on the number of Gaussians after each round of density control. A change takes effect a few steps
     later, because photos are read in advance. So a resumed run takes the same steps as an uninterrupted one.
