@@ -271,6 +271,17 @@ class Scene:
         """Return training and held-out views together, sorted by name."""
         return sorted(self.train + self.test, key=lambda view: view.name)
 
+    def shown_points(self, view: View) -> np.ndarray:
+        """Return the rows (M,) of the points that a photo shows.
+
+        They are those of its tracks. Without any tracks they are all points in its picture, also occluded ones.
+        """
+        if self.tracks:
+            return self.tracks.get(view.name, np.zeros(0, np.int64))
+        camera = view.camera
+        x, y, z = camera.project(self.points)
+        return np.flatnonzero((z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))
+
 
 def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
     """Select at most `count` evenly spaced items (for instance views), including the first and the last."""

@@ -115,7 +115,7 @@ def plan_blocks(scene: Scene, columns: int, rows: int) -> BlockPlan:
             fix=f"use at most {max(1, len(photos) // MIN_BLOCK_PHOTOS)} blocks; each needs {MIN_BLOCK_PHOTOS} photos",
         )
     cells = divide_ground(scene, columns, rows)
-    core, seen = cells.find(scene.points), [visible_rows(scene, view) for view in photos]
+    core, seen = cells.find(scene.points), [scene.shown_points(view) for view in photos]
     member = _assign_photos(cells, scene.points, core, photos, seen)
     blocks = []
     for group in _merge_small_groups(cells, scene.points, core, member):
@@ -125,15 +125,6 @@ def plan_blocks(scene: Scene, columns: int, rows: int) -> BlockPlan:
             used[seen[photo]] = True
         blocks.append(Block(cells.name(group[0]), tuple(group), [photos[n] for n in chosen], used))
     return BlockPlan(cells, sorted(blocks, key=lambda block: (-len(block.photos), block.cells)))
-
-
-def visible_rows(scene: Scene, view: View) -> np.ndarray:
-    """Return the rows (M,) of the points that a photo shows: those of its tracks, or all in its picture without any."""
-    if scene.tracks:
-        return scene.tracks.get(view.name, np.zeros(0, np.int64))
-    camera = view.camera
-    x, y, z = camera.project(scene.points)
-    return np.flatnonzero((z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))
 
 
 def _assign_photos(

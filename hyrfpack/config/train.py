@@ -136,7 +136,7 @@ class TrainConfig:
         max_gaussians: budget: the maximum number of Gaussians. Default: measured by pilot runs.
         budget_factor: the budget as a multiple of what pixels and steps suggest. Default: measured by pilot runs.
         target_bytes: choose the budget so that 'hyrfpack compress' reaches this file size, such as 500kB.
-        interpolate_points: start with points between those of the scene, up to the budget, if photos have tracks.
+        surface_points: start with points on surfaces that photos show, beside those of the scene, up to the budget.
         log2_table_size: rows per level of the hash grid: 2^B.
         background: train a background sphere. Default: by preset.
         exposure: exposure compensation: learn per-image gains and an exposure map. Default: decided by pilot runs.
@@ -159,7 +159,7 @@ class TrainConfig:
     max_gaussians: Annotated[int | None, Range(1)] = None
     budget_factor: Annotated[float | None, Range(1e-3, 1e3)] = None
     target_bytes: Annotated[int | None, Range(1, unit="bytes")] = None
-    interpolate_points: bool = True
+    surface_points: bool = True
     log2_table_size: Annotated[int | None, Range(4, 24, unit="b")] = None
     background: bool | None = None
     exposure: bool | None = None

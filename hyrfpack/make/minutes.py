@@ -32,7 +32,7 @@ from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.decisions import decide, is_budget_open
 from hyrfpack.train.resolution import PhotoSize
-from hyrfpack.train.setup import budget_for, estimate_initial_count
+from hyrfpack.train.setup import budget_for
 
 _LOG = logging.getLogger(__name__)
 
@@ -83,9 +83,9 @@ class SceneCost:
     def training_seconds(self, scene: Scene, steps: int) -> float:
         """Estimate the seconds of a training run from its mean number of Gaussians."""
         budget = self._budget(scene, steps)
-        initial, density = estimate_initial_count(scene, budget), DensityConfig()
-        step = self.step_seconds + self.step_seconds_per_gaussian * density.mean_count(initial, budget)
-        step *= PhotoSize.of_views(scene.train).mean_step_cost(density, initial, budget)
+        density = DensityConfig()
+        step = self.step_seconds + self.step_seconds_per_gaussian * density.mean_count(budget, budget)
+        step *= PhotoSize.of_views(scene.train).mean_step_cost(density, budget, budget)
         return TRAINED_PACE_RATIO * steps * step + self.decoding_seconds * min(steps, len(scene.train))
 
     def seconds_after_training(self, scene: Scene, steps: int) -> dict[str, float]:
@@ -227,7 +227,7 @@ def measure_scene_cost(
         preset=requested.preset,
         max_gaussians=budget,
         density=PROBE_DENSITY,
-        interpolate_points=False,
+        surface_points=False,
     )
     trainer = Trainer(scene, config, cache, device)
     counts: list[int] = []

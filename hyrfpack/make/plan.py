@@ -24,7 +24,7 @@ from hyrfpack.train.decisions import (
 from hyrfpack.train.length_pilots import max_length_pilot_steps
 from hyrfpack.train.pilots import BUDGET_REFERENCE_STEPS
 from hyrfpack.train.resolution import PhotoSize
-from hyrfpack.train.setup import budget_for, estimate_initial_count, usual_budget
+from hyrfpack.train.setup import budget_for, usual_budget
 
 # Measured on two CPU cores, for the first estimate only; during the work, measured times replace it.
 CPU_STEP_SECONDS = 0.03  # time of a training step that does not depend on the photo's size
@@ -151,7 +151,6 @@ def mean_megapixels(scene: Scene) -> float:
 def estimate_seconds(
     size: PhotoSize,
     plan: Plan,
-    initial: int,
     gaussians: int,
     held_out: int,
     pilot_steps: float,
@@ -162,7 +161,7 @@ def estimate_seconds(
     Args:
         size: size of the photos.
         plan: the plan.
-        initial, gaussians: expected number of Gaussians at the start and at the end.
+        gaussians: expected number of Gaussians, at the start and at the end.
         held_out: number of photos that are scored.
         pilot_steps: number of steps of all pilot runs, see `max_pilot_steps`.
         device: device of the training.
@@ -178,8 +177,8 @@ def estimate_seconds(
     )
     pilot_gaussians = usual_budget(size.pixels, size.pixels, BUDGET_REFERENCE_STEPS)
     step_seconds, pilot_step_seconds = (
-        fixed + pixels * per_megapixel * size.mean_step_cost(DensityConfig(), min(initial, most), most)
-        for most in (gaussians, pilot_gaussians)
+        fixed + pixels * per_megapixel * size.mean_step_cost(DensityConfig(), count, count)
+        for count in (gaussians, pilot_gaussians)
     )
     return {
         "pilots": pilot_steps * pilot_step_seconds,
@@ -196,9 +195,8 @@ def estimate_scene_seconds(scene: Scene, plan: Plan, device: torch.device) -> di
     """Return `estimate_seconds` for a loaded scene."""
     config = plan.train_config(seed=0)
     gaussians, _ = budget_for(scene, config)
-    initial = estimate_initial_count(scene, gaussians)
     size = PhotoSize.of_views(scene.train)
-    return estimate_seconds(size, plan, initial, gaussians, len(scene.test), max_pilot_steps(scene, config), device)
+    return estimate_seconds(size, plan, gaussians, len(scene.test), max_pilot_steps(scene, config), device)
 
 
 def expected_photo_size(size: tuple[int, int] | None, max_size: int) -> PhotoSize:
@@ -216,5 +214,5 @@ def estimate_photos_seconds(count: int, size: PhotoSize, plan: Plan, device: tor
     pilot_steps += max_length_pilot_steps(trained, plan.steps) * plan.early_stop
     return {
         "poses": POSE_SECONDS_PER_PHOTO * count,
-        **estimate_seconds(size, plan, gaussians, gaussians, count // 8, pilot_steps, device),
+        **estimate_seconds(size, plan, gaussians, count // 8, pilot_steps, device),
     }

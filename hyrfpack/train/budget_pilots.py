@@ -4,7 +4,7 @@ Suppose that n Gaussians have the `quality_score` a + g log2(n) on validation ph
 same. Then the best number of Gaussians is proportional to g. A plain scene needs fewer than a detailed one, even if its
 photos have more pixels. Two pilots measure g, one with a quarter of the usual budget and one with the full one. If g is
 small, two more pilots with another seed confirm it. Both start from the points of the scene alone, so that they differ
-in the number of Gaussians and not in the number of interpolated points.
+in the number of Gaussians and not in the number of points on surfaces.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def measure_budget(pilots: ScenePilots, exposure: bool) -> tuple[float, str]:
                 seed=seed,
                 exposure=exposure,
                 max_gaussians=budget,
-                interpolate_points=False,
+                surface_points=False,
             )
             for number, budget in enumerate((small, usual), 1)
         )

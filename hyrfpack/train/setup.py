@@ -7,6 +7,7 @@ All sizes are chosen by the photos and the length of the run. Each choice is rec
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -22,9 +23,9 @@ from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
 from hyrfpack.scene import Scene
-from hyrfpack.train.interpolated_points import interpolate_points
 from hyrfpack.train.provenance import training_provenance
 from hyrfpack.train.silhouette import inside_silhouettes
+from hyrfpack.train.surface_points import draw_surface_points
 
 SYNTHETIC_HALF_BOX = 1.3  # NeRF-synthetic objects lie in [-1.3, 1.3]^3.
 # The budget of a full-length run is the larger of two numbers, one by the pixels of one photo and one by those of all
@@ -191,14 +192,8 @@ def build_model(
         direction_encoding=config.direction_encoding,
         antialiased=config.antialiased,
     )
-    pictures = (cache or PictureCache(0)) if config.interpolate_points else None
-    points, colors = initial_points(scene, frame, budget, config.seed, pictures)
-    if len(points) > len(scene.points) > 0:
-        source = f"{len(scene.points):,} points of the scene and others interpolated between them"
-    elif len(scene.points):
-        source = "points of the scene"
-    else:
-        source = "random, inside the silhouettes" if scene.has_alpha else "random, in the box"
+    pictures = (cache or PictureCache(0)) if config.surface_points else None
+    points, colors, source = initial_points(scene, frame, budget, config.seed, pictures)
     model = HybridModel(model_config, _gaussians(points, colors, model_config), _generator(config.seed))
     choices = {
         "preset": f"{preset}: {why_preset}",
@@ -210,40 +205,52 @@ def build_model(
     return model, budget, choices
 
 
-def estimate_initial_count(scene: Scene, budget: int) -> int:
-    """Return how many Gaussians a run with this budget starts with, at most, without reading a photo."""
-    if not len(scene.points):
-        return max(1, budget // 2)
-    return budget if scene.tracks else min(budget, len(scene.points))
-
-
 def initial_points(
     scene: Scene, frame: Frame, budget: int, seed: int, cache: PictureCache | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return initial local positions (N, 3) float64 and colours (N, 3) in [0, 1], where N is at most the budget.
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Choose initial points, at most as many as the budget.
 
-    They are the scene's points, or a random subset of them. If there are fewer than the budget, `interpolate_points`
-    adds the rest where tracks allow it, from photos read by `cache`; None adds none. A scene without points starts
-    from random points in the box, half as many as the budget; if photos have transparency, they lie in the visual hull.
-    Outliers of the reconstruction are moved along the line to the frame's centre until half precision can represent
-    their coordinates.
+    They are the scene's points, or a random subset of them. If there are fewer than the budget, `draw_surface_points`
+    adds others from photos read by `cache`; None adds none. A scene without points starts from points on surfaces
+    alone. Where none are found it starts from random points in the box, half as many as the budget; if photos have
+    transparency, these lie in the visual hull. Outliers are moved along the line to the frame's centre until half
+    precision can represent their coordinates.
+
+    Returns:
+        Local positions (N, 3) float64, colours (N, 3) in [0, 1], and where they come from, in words.
     """
     generator = np.random.default_rng(seed)
     if len(scene.points):
         points, colors = scene.points, np.asarray(scene.point_colors, np.float64)
+        source = "points of the scene"
         if len(points) > budget:
             chosen = np.sort(generator.choice(len(points), budget, replace=False))
             points, colors = points[chosen], colors[chosen]
         elif len(points) < budget and cache is not None:
-            more, more_colors = interpolate_points(scene, cache, budget - len(points), generator)
-            points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
-        points = frame.to_local(points)
-        return points / np.maximum(1, np.abs(points).max(axis=1, keepdims=True) / MAX_INITIAL_COORDINATE), colors
-    count = estimate_initial_count(scene, budget)
-    half = np.array(frame.half_extent)
-    if not scene.has_alpha:
-        return generator.uniform(-half, half, (count, 3)), np.full((count, 3), 0.5)
-    return inside_silhouettes(scene, frame, count, generator)
+            more, more_colors = draw_surface_points(scene, cache, budget - len(points), generator)
+            if len(more):
+                source = f"{len(points):,} points of the scene, the others on surfaces that photos show"
+                points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
+        return _representable(frame.to_local(points)), colors, source
+    count, half = max(1, budget // 2), np.array(frame.half_extent)
+    if scene.has_alpha:
+        points, colors = inside_silhouettes(scene, frame, count, generator)
+        source = "random, inside the silhouettes"
+    else:
+        points, colors = generator.uniform(-half, half, (count, 3)), np.full((count, 3), 0.5)
+        source = "random, in the box"
+    if cache is not None:
+        guesses = replace(scene, points=frame.to_world(points), point_colors=colors.astype(np.float32), tracks={})
+        found, found_colors = draw_surface_points(guesses, cache, budget, generator)
+        if len(found):
+            return _representable(frame.to_local(found)), found_colors, "on surfaces that photos show"
+    return points, colors, source
+
+
+def _representable(local: np.ndarray) -> np.ndarray:
+    """Move local points (N, 3) towards the origin until half precision can represent their coordinates."""
+    largest = np.abs(local).max(axis=1, keepdims=True)
+    return np.asarray(local / np.maximum(1, largest / MAX_INITIAL_COORDINATE))
 
 
 def _gaussians(points: np.ndarray, colors: np.ndarray, config: ModelConfig) -> Gaussians:

@@ -12,7 +12,7 @@ from property_tests import examples
 from scenes import look_at
 
 from hyrfpack.blocks.cells import divide_ground
-from hyrfpack.blocks.plan import MIN_BLOCK_PHOTOS, MIN_PHOTO_SHARE, parse_grid, plan_blocks, visible_rows
+from hyrfpack.blocks.plan import MIN_BLOCK_PHOTOS, MIN_PHOTO_SHARE, parse_grid, plan_blocks
 from hyrfpack.errors import HyrfError
 from hyrfpack.scene import Camera, Picture, Scene, View
 
@@ -70,7 +70,7 @@ def test_cores_tile_space_and_every_photo_and_point_is_in_a_block(scene, grid, s
         assert {tuple(point) for point in scene.points[plan.core_mask(block, scene.points)].tolist()} <= held
         assert len(cut.train) >= MIN_BLOCK_PHOTOS and not cut.test
         for view in cut.train:
-            seen, kept = scene.points[visible_rows(scene, view)], cut.points[visible_rows(cut, view)]
+            seen, kept = scene.points[scene.shown_points(view)], cut.points[cut.shown_points(view)]
             assert np.array_equal(seen, kept)
     assert sorted(cell for block in plan.blocks for cell in block.cells) == list(range(plan.cells.count))
 

@@ -30,7 +30,7 @@ INVALID_SETTINGS = {
     "exposure": (1, "no", math.nan),
     "early_stop": (None, 1, "yes"),
     "resolution_schedule": (None, 1, "yes"),
-    "interpolate_points": (None, 1, "yes"),
+    "surface_points": (None, 1, "yes"),
     "background_color": ("grey", None),
     "antialiased": (None, 1, "yes"),
     "ssim_weight": (1.1, -0.1, *NON_FLOATS),

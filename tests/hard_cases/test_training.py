@@ -258,7 +258,7 @@ def test_far_outliers_are_moved_closer_along_their_direction():
     local = np.array([[1.0, 2.0, -3.0], [0.0, -MAX_INITIAL_COORDINATE, 1.0], [4e6, -3e6, 1e6], [1e300, 0.0, 1e299]])
     scene = scene_with_points(frame.to_world(local))
 
-    points, _ = initial_points(scene, frame, budget=10, seed=0)
+    points, _, _ = initial_points(scene, frame, budget=10, seed=0)
 
     np.testing.assert_allclose(points[:2], local[:2], rtol=1e-12)
     pulled_in = MAX_INITIAL_COORDINATE * np.array([[1, -0.75, 0.25], [1, 0, 0.1]])

@@ -250,7 +250,7 @@ def test_an_explicit_table_size_is_kept():
 def test_points_start_the_gaussians_in_local_units():
     scene = ball_scene(points=50, scale=3.0, offset=(100, 0, -5))
     frame = scene_frame(scene, "standard")
-    positions, colors = initial_points(scene, frame, 1000, seed=0)
+    positions, colors, _ = initial_points(scene, frame, 1000, seed=0)
     np.testing.assert_allclose(positions * frame.scale + frame.center, scene.points, atol=1e-9)
     np.testing.assert_allclose(colors, scene.point_colors)
 
@@ -259,7 +259,7 @@ def test_too_many_points_are_thinned_to_the_budget():
     scene = ball_scene(points=500)
     frame = scene_frame(scene, "standard")
 
-    positions, colors = initial_points(scene, frame, 60, seed=3)
+    positions, colors, _ = initial_points(scene, frame, 60, seed=3)
 
     known = {tuple(point): tuple(color) for point, color in zip(scene.points, scene.point_colors, strict=True)}
     world = frame.to_world(positions)
@@ -275,7 +275,7 @@ def test_without_points_half_a_budget_fills_the_box_at_random():
     scene = make_rig_scene(ring(12))
     frame = Frame.from_box(np.array([-2.0, -1, 0]), np.array([2.0, 1, 3]))
 
-    positions, colors = initial_points(scene, frame, 2000, seed=0)
+    positions, colors, _ = initial_points(scene, frame, 2000, seed=0)
 
     assert positions.shape == colors.shape == (1000, 3)
     half = np.array(frame.half_extent)
@@ -292,7 +292,7 @@ def alpha_scene(views: int = 10) -> Scene:
 def test_with_coverage_points_start_inside_the_hull():
     scene, frame = alpha_scene(), Frame((0.0, 0.0, 0.0), 1.3, (1.0, 1.0, 1.0))
 
-    positions, colors = initial_points(scene, frame, 400, seed=0)
+    positions, colors, _ = initial_points(scene, frame, 400, seed=0)
 
     assert len(positions) == 200
     for view in scene.train:
@@ -322,7 +322,7 @@ def test_empty_silhouettes_still_start_some_gaussians(budget):
 @pytest.mark.parametrize(("encoding", "noise"), [("sh", 0.08), ("frequency", 0.31)])
 def test_first_gaussians_look_like_the_points(encoding, noise):
     scene = ball_scene(points=80)
-    model, _, _ = build_model(scene, TrainConfig(direction_encoding=encoding))
+    model, _, _ = build_model(scene, TrainConfig(direction_encoding=encoding, surface_points=False))
     points = model.config.frame.to_local(scene.points)
     gaps = np.sort(np.linalg.norm(points[:, None] - points[None], axis=2), axis=1)[:, 1:4]
 
@@ -389,7 +389,7 @@ def test_choices_are_recorded_with_reasons():
     ],
 )
 def test_the_first_gaussians_origin_is_recorded(make, source):
-    model, _, choices = build_model(make(), TrainConfig(max_gaussians=200))
+    model, _, choices = build_model(make(), TrainConfig(max_gaussians=200, surface_points=False))
     assert choices["initial_gaussians"] == f"{len(model)}: {source}"
 
 

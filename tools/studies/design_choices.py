@@ -52,7 +52,7 @@ CHOICES_BY_VARIANT = {
     "fields pass gradients to positions": Choice(model={"position_gradients": True}),
     "no background sphere": Choice({"background": False}),
     "antialiased": Choice({"antialiased": True}),
-    "points of the reconstruction alone": Choice({"interpolate_points": False}),
+    "points of the reconstruction alone": Choice({"surface_points": False}),
 }
 
 

@@ -1,0 +1,105 @@
+"""hyrfpack.stereo: depths of known planes, sources, agreement, and photos for which there is no depth."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from textured_planes import camera_at, depths_of_planes, photograph
+
+from hyrfpack.stereo import Photo, count_agreeing, estimate_depth_maps
+from hyrfpack.stereo.depth_maps import PLANES
+from hyrfpack.stereo.sources import MAX_SOURCES, choose_sources
+
+WALL = (4.0, 0.0, -np.inf, np.inf)
+SLANTED = (4.0, 0.4, -np.inf, np.inf)
+BOARD = (2.5, 0.0, -0.4, 0.4)
+PLACES = [(0.0, 0.0), (0.35, 0.05), (-0.35, 0.0), (0.1, 0.35), (0.0, -0.35)]
+CAMERAS = [camera_at(*place) for place in PLACES]
+
+
+def points_on(planes, camera=CAMERAS[0], count: int = 60) -> np.ndarray:
+    """Return points (N, 3) on the planes at random pixels of a camera."""
+    depth, _ = depths_of_planes(camera, planes)
+    generator = np.random.default_rng(0)
+    row, column = generator.integers(0, camera.height, count), generator.integers(0, camera.width, count)
+    return camera.unproject(column + 0.5, row + 0.5, depth[row, column])
+
+
+def photos_of(planes) -> tuple[list[Photo], np.ndarray]:
+    points = points_on(planes)
+    return [photograph(camera, planes, points) for camera in CAMERAS], points
+
+
+@pytest.mark.parametrize("planes", [[WALL], [SLANTED], [WALL, BOARD]], ids=["wall", "slanted", "board"])
+@pytest.mark.parametrize("unit", [1.0, 1e-4, 1e5])
+def test_depths_are_those_of_the_planes_in_any_unit(planes, unit):
+    photos, points = photos_of(planes)
+    truth, _ = depths_of_planes(CAMERAS[0], planes)
+    scaled = []
+    for photo in photos:
+        pose = photo.camera.camera_from_world.copy()
+        pose[:3, 3] *= unit
+        scaled.append(dataclasses.replace(photo, camera=dataclasses.replace(photo.camera, camera_from_world=pose)))
+    maps = estimate_depth_maps(scaled, unit * points)
+    agreed = count_agreeing(maps, 0) >= 2
+    errors = np.abs(maps[0].inverse - 1 / (unit * truth)) / maps[0].spacing
+    assert agreed.mean() > 0.75
+    assert np.quantile(errors[agreed], 0.9) < 1 and np.median(errors[agreed]) < 0.4
+
+
+def test_exposure_does_not_change_depths():
+    photos, points = photos_of([WALL, BOARD])
+    darker = [dataclasses.replace(photo, grey=photo.grey * np.float32(0.4 + 0.1 * i)) for i, photo in enumerate(photos)]
+    usual, changed = (estimate_depth_maps(some, points)[0] for some in (photos, darker))
+    assert (np.abs(usual.inverse - changed.inverse) < usual.spacing).mean() > 0.95
+
+
+def test_a_moved_object_has_no_agreement():
+    """The board stands elsewhere in each photo."""
+    planes = [[WALL, (2.5, 0.0, -0.4 + shift, 0.4 + shift)] for shift in (0.0, 0.9, -0.9, 0.9, -0.9)]
+    points = points_on([WALL])
+    photos = [photograph(camera, shown, points) for camera, shown in zip(CAMERAS, planes, strict=True)]
+    agreed = count_agreeing(estimate_depth_maps(photos, points), 0) >= 2
+    depth, _ = depths_of_planes(CAMERAS[0], planes[0])
+    board = np.zeros_like(agreed)
+    board[4:-4, 4:-4] = (depth < 3)[4:-4, 4:-4]
+    assert agreed[board].mean() < 0.5 * agreed[~board].mean()
+
+
+def test_photos_of_one_place_give_no_depth():
+    camera = CAMERAS[0]
+    points = points_on([WALL])
+    photos = [photograph(camera, [WALL], points)] * 3
+    assert estimate_depth_maps(photos, points) == [None] * 3
+
+
+def test_photos_that_share_no_points_have_no_depth_map():
+    photos, points = photos_of([WALL])
+    photos[0] = dataclasses.replace(photos[0], points=np.zeros(0, np.int64))
+    maps = estimate_depth_maps(photos, points)
+    assert maps[0] is None and all(found is not None for found in maps[1:])
+    assert count_agreeing(maps, 1).max() <= MAX_SOURCES - 1
+    assert estimate_depth_maps(photos[:1], points) == [None]
+    assert estimate_depth_maps([], points) == []
+
+
+def test_depth_maps_are_finite_and_within_their_planes():
+    generator = np.random.default_rng(0)
+    _, points = photos_of([WALL])
+    photos = [Photo(camera, generator.random((48, 64), np.float32), np.arange(len(points))) for camera in CAMERAS]
+    for depth_map in estimate_depth_maps(photos, points):
+        assert depth_map.inverse.dtype == np.float32 and np.isfinite(depth_map.inverse).all()
+        assert depth_map.inverse.min() >= 0 and depth_map.inverse.max() <= PLANES * depth_map.spacing
+
+
+def test_sources_share_points_and_see_them_from_about_five_degrees():
+    points = points_on([WALL])
+    cameras = [camera_at(x) for x in (0.0, 0.01, 0.35, 0.5, -0.35, 2.0, -3.0)]
+    everything = np.arange(len(points))
+    seen = [everything] * 6 + [everything[:4]]
+    sources = choose_sources(cameras, points, seen)
+    assert set(sources[0][:3]) == {2, 3, 4} and 1 not in sources[0] and 6 not in sources[0]
+    assert sources[6] == []
+    assert all(len(found) <= MAX_SOURCES for found in sources)
