@@ -87,8 +87,8 @@ def _compare(start, stop, photo, mean, variance, other, homography, offset, inve
                 u = (h[0][0] * px + h[0][1] * py + h[0][2] + ox) / w
                 v = (h[1][0] * px + h[1][1] * py + h[1][2] + oy) / w
                 seen[y, x] = front and 0.5 <= u <= other_width - 0.5 and 0.5 <= v <= other_height - 0.5
-                u = min(max(u - 0.5, 0.0), other_width - 1.0)
-                v = min(max(v - 0.5, 0.0), other_height - 1.0)
+                u = min(u - 0.5, other_width - 1.0) if u > 0.5 else 0.0  # 0 for NaN, too
+                v = min(v - 0.5, other_height - 1.0) if v > 0.5 else 0.0
                 left, top = int(u), int(v)
                 right, bottom = min(left + 1, other_width - 1), min(top + 1, other_height - 1)
                 a, b = np.float32(u - left), np.float32(v - top)

@@ -40,7 +40,7 @@ class DepthMap:
 
     Attributes:
         camera: the photo's camera.
-        inverse: (H, W) float32, 1 / z in inverse world units; 0 is infinitely far.
+        inverse: (H, W) float64, 1 / z in inverse world units; 0 is infinitely far.
         spacing: difference between the inverse depths of neighbouring planes.
         sources: indices of the photos that it was compared with.
     """
@@ -76,7 +76,7 @@ def _estimate(photo: Photo, points: np.ndarray, others: Sequence[Photo], sources
     z = z[z > 0]
     if not len(z) or not others:
         return None
-    nearest = NEAREST_SHARE * float(np.quantile(z, NEAR_QUANTILE))
+    nearest = max(NEAREST_SHARE * float(np.quantile(z, NEAR_QUANTILE)), np.finfo(np.float64).tiny)
     inverses = np.linspace(0, 1 / nearest, PLANES)
     costs = sweep_costs(photo.camera, photo.grey, [(other.camera, other.grey) for other in others], inverses)
     total = aggregate_costs(costs, photo.grey)
@@ -86,7 +86,7 @@ def _estimate(photo: Photo, points: np.ndarray, others: Sequence[Photo], sources
     curvature = np.maximum(before - 2 * at + after, 1e-6)
     shift = np.where(best == middle, np.clip((before - after) / (2 * curvature), -0.5, 0.5), 0)
     spacing = float(inverses[1])
-    return DepthMap(photo.camera, ((best + shift) * spacing).astype(np.float32), spacing, sources)
+    return DepthMap(photo.camera, (best + shift) * spacing, spacing, sources)
 
 
 def count_agreeing(maps: Sequence[DepthMap | None], index: int) -> np.ndarray:

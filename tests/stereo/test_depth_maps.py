@@ -90,7 +90,7 @@ def test_depth_maps_are_finite_and_within_their_planes():
     _, points = photos_of([WALL])
     photos = [Photo(camera, generator.random((48, 64), np.float32), np.arange(len(points))) for camera in CAMERAS]
     for depth_map in estimate_depth_maps(photos, points):
-        assert depth_map.inverse.dtype == np.float32 and np.isfinite(depth_map.inverse).all()
+        assert depth_map.inverse.dtype == np.float64 and np.isfinite(depth_map.inverse).all()
         assert depth_map.inverse.min() >= 0 and depth_map.inverse.max() <= PLANES * depth_map.spacing
 
 
@@ -103,3 +103,14 @@ def test_sources_share_points_and_see_them_from_about_five_degrees():
     assert set(sources[0][:3]) == {2, 3, 4} and 1 not in sources[0] and 6 not in sources[0]
     assert sources[6] == []
     assert all(len(found) <= MAX_SOURCES for found in sources)
+
+
+@pytest.mark.parametrize("depth", [1e-300, 1e-30, 1e30, 1e100])
+def test_points_in_a_camera_or_very_far_away_do_no_harm(depth):
+    """Then all planes are far too near or far, products overflow, and no photo agrees."""
+    photos, points = photos_of([WALL])
+    moved = points.copy()
+    moved[:, 2] = depth
+    for index, depth_map in enumerate(maps := estimate_depth_maps(photos, moved)):
+        if depth_map is not None:
+            assert np.isfinite(depth_map.inverse).all() and count_agreeing(maps, index).shape == (48, 64)
