@@ -53,4 +53,4 @@ def photograph(camera: Camera, planes, points: np.ndarray) -> Photo:
     _, grey = depths_of_planes(camera, planes)
     x, y, z = camera.project(points)
     shown = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    return Photo(camera, grey.astype(np.float32), np.flatnonzero(shown))
+    return Photo(camera, grey.astype(np.float32), np.ones(grey.shape, bool), np.flatnonzero(shown))

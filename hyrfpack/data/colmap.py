@@ -72,7 +72,8 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
         notes.append(unregistered_note(unposed))
     if not len(points):
         notes.append(
-            f"the model in {tables.relative_to(path)} has no points; training starts from random positions instead"
+            f"the model in {tables.relative_to(path)} has no points; training looks for surfaces without them, or "
+            "starts from random positions"
         )
     pictures = PictureIndex(folder)
     matches = pictures.match(names)

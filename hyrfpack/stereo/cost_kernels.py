@@ -14,7 +14,7 @@ WINDOW_RADIUS = 3
 NOISE_VARIANCE = (2 / 255) ** 2
 _MIN_PLANES_PER_RANGE = 8
 _MIN_ROWS_PER_RANGE = 16
-UNSEEN = np.float32(2.0)  # Cost where the other photo does not show the pixel's point.
+UNSEEN_COST = np.float32(2.0)  # Cost where the other photo does not show the pixel's point.
 _kernel = compiled(fastmath={"contract", "nsz"}, error_model="numpy")
 
 
@@ -55,7 +55,7 @@ def _window_means(values, rows, out):
 
 
 @_kernel
-def _compare(start, stop, photo, mean, variance, other, homography, offset, inverses, costs):
+def _compare(start, stop, photo, mean, variance, other, homography, offset, inverse_depths, costs):
     """Write the costs of planes start to stop, 1 - max(0, correlation) of windows, to costs[start:stop].
 
     Args:
@@ -63,7 +63,7 @@ def _compare(start, stop, photo, mean, variance, other, homography, offset, inve
         other: (H2, W2) float32, grey values of the other photo.
         homography, offset: 3 x 3 and 3, float64: the pixel (x, y) at depth z lies in the other photo at the first two
             numbers of homography (x, y, 1) + offset / z, divided by the third one.
-        inverses: (P,) float64, 1 / z of the planes.
+        inverse_depths: (P,) float64, 1 / z of the planes.
         costs: (P, H, W) float32.
     """
     height, width = photo.shape
@@ -77,7 +77,8 @@ def _compare(start, stop, photo, mean, variance, other, homography, offset, inve
     seen = np.empty((height, width), np.bool_)
     h = homography
     for plane in range(start, stop):
-        ox, oy, oz = offset[0] * inverses[plane], offset[1] * inverses[plane], offset[2] * inverses[plane]
+        inverse_depth = inverse_depths[plane]
+        ox, oy, oz = offset[0] * inverse_depth, offset[1] * inverse_depth, offset[2] * inverse_depth
         for y in range(height):
             for x in range(width):
                 px, py = x + 0.5, y + 0.5
@@ -111,7 +112,7 @@ def _compare(start, stop, photo, mean, variance, other, homography, offset, inve
                 covariance = product_mean[y, x] - m * mean[y, x]
                 correlation = covariance / math.sqrt(spread * (variance[y, x] + np.float32(NOISE_VARIANCE)))
                 cost = np.float32(1) - min(max(correlation, np.float32(0)), np.float32(1))
-                costs[plane, y, x] = cost if seen[y, x] else UNSEEN
+                costs[plane, y, x] = cost if seen[y, x] else UNSEEN_COST
 
 
 @_kernel
@@ -119,7 +120,7 @@ def _combine(start, stop, costs, combined):
     """Write the mean cost of the better half of the photos that show a pixel's point to combined[start:stop].
 
     Args:
-        costs: (S, P, H, W) float32, `UNSEEN` where a photo does not show the point.
+        costs: (S, P, H, W) float32, `UNSEEN_COST` where a photo does not show the point.
         combined: (H, W, P) float32, 1 where no photo does.
     """
     count, planes, _, width = costs.shape
@@ -130,7 +131,7 @@ def _combine(start, stop, costs, combined):
                 seen = 0
                 for source in range(count):
                     cost = costs[source, plane, y, x]
-                    if cost == UNSEEN:
+                    if cost == UNSEEN_COST:
                         continue
                     at = seen
                     while at > 0 and ordered[at - 1] > cost:
@@ -159,15 +160,15 @@ def compare_on_planes(
     other: np.ndarray,
     homography: np.ndarray,
     offset: np.ndarray,
-    inverses: np.ndarray,
+    inverse_depths: np.ndarray,
 ) -> np.ndarray:
     """Return the costs (P, H, W) float32 of a photo's pixels on planes; arguments as in `_compare`."""
-    costs = np.empty((len(inverses), *photo.shape), np.float32)
+    costs = np.empty((len(inverse_depths), *photo.shape), np.float32)
 
     def task(start: int, stop: int) -> None:
-        _compare(start, stop, photo, mean, variance, other, homography, offset, inverses, costs)
+        _compare(start, stop, photo, mean, variance, other, homography, offset, inverse_depths, costs)
 
-    run_ranges(task, len(inverses), _MIN_PLANES_PER_RANGE)
+    run_ranges(task, len(inverse_depths), _MIN_PLANES_PER_RANGE)
     return costs
 
 

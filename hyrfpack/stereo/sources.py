@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import numpy as np
 
@@ -41,21 +42,18 @@ def choose_sources(cameras: Sequence[Camera], points: np.ndarray, seen: Sequence
     for row, indices in zip(shows, seen, strict=True):
         row[indices] = True
     centers = [camera.position for camera in cameras]
-    sources = []
-    for first, own in enumerate(shows):
-        scores = np.zeros(len(cameras))
-        for second, other in enumerate(shows):
-            shared = np.flatnonzero(own & other)
-            if first != second and len(shared) >= MIN_SHARED_POINTS:
-                some = shared[:: -(-len(shared) // MAX_MEASURED_POINTS)]
-                angles = _angles(points[some], centers[first], centers[second])
-                if MIN_ANGLE_DEGREES <= np.median(angles) <= MAX_ANGLE_DEGREES:
-                    spread = np.where(angles < BEST_ANGLE_DEGREES, SMALLER_ANGLES_DEGREES, LARGER_ANGLES_DEGREES)
-                    weights = np.exp(-((angles - BEST_ANGLE_DEGREES) ** 2) / (2 * spread**2))
-                    scores[second] = len(shared) * weights.mean()
-        order = np.argsort(-scores, kind="stable")[:MAX_SOURCES]
-        sources.append([int(index) for index in order if scores[index] > 0])
-    return sources
+    scores = np.zeros((len(cameras), len(cameras)))
+    for first, second in combinations(range(len(cameras)), 2):
+        shared = np.flatnonzero(shows[first] & shows[second])
+        if len(shared) >= MIN_SHARED_POINTS:
+            some = shared[:: -(-len(shared) // MAX_MEASURED_POINTS)]
+            angles = _angles(points[some], centers[first], centers[second])
+            if MIN_ANGLE_DEGREES <= np.median(angles) <= MAX_ANGLE_DEGREES:
+                spread = np.where(angles < BEST_ANGLE_DEGREES, SMALLER_ANGLES_DEGREES, LARGER_ANGLES_DEGREES)
+                weights = np.exp(-((angles - BEST_ANGLE_DEGREES) ** 2) / (2 * spread**2))
+                scores[first, second] = scores[second, first] = len(shared) * weights.mean()
+    best = np.argsort(-scores, axis=1, kind="stable")[:, :MAX_SOURCES]
+    return [[int(index) for index in row if own[index] > 0] for row, own in zip(best, scores, strict=True)]
 
 
 def _angles(points: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -48,7 +48,7 @@ def find_count_problems(count: int, scene: Scene | None, posed: int, path: Path)
         )
     if not len(scene.points):
         found.append(
-            "there are no points, so training starts at random positions; add the points of the reconstruction"
+            "there are no points, so training has to find surfaces without them; add the points of the reconstruction"
         )
     return found
 

@@ -146,7 +146,7 @@ class ScenePilots:
         seed: int,
         exposure: bool,
         max_gaussians: int | None = None,
-        surface_points: bool = True,
+        surface_points: bool | None = None,
     ) -> PilotScore:
         """Train a pilot and score it on the validation photos.
 
@@ -155,7 +155,7 @@ class ScenePilots:
             fold: photos to train on and validation photos.
             steps: number of steps of the pilot.
             seed, exposure, max_gaussians: replace those of the main run; without `max_gaussians` the fold's budget.
-            surface_points: as in `TrainConfig`.
+            surface_points: as in `TrainConfig`; None takes that of the main run.
 
         Raises:
             PilotsStopped: `stop` returned True.
@@ -168,7 +168,7 @@ class ScenePilots:
             seed=seed,
             exposure=exposure,
             max_gaussians=max_gaussians,
-            surface_points=surface_points,
+            surface_points=self.config.surface_points if surface_points is None else surface_points,
             budget_factor=None,
             target_bytes=None,
         )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import Delaunay, QhullError
@@ -14,12 +15,14 @@ from scipy.spatial import Delaunay, QhullError
 from hyrfpack.data.cache import PictureCache
 from hyrfpack.data.reduced import reduce_camera, reduce_picture
 from hyrfpack.scene import Camera, Picture, Scene, evenly_spaced
-from hyrfpack.stereo import DepthMap, Photo, count_agreeing, estimate_depth_maps
+from hyrfpack.stereo import InverseDepthMap, Photo, count_agreeing, estimate_depth_maps
 
 MAX_PHOTOS = 100  # More photos are not read: they show the same surfaces.
+# Without tracks, points only tell which photos show the same place, and how near surfaces can be.
+MAX_GUIDING_POINTS = 10_000
 # Depths are estimated from photos whose longer side has at most this many pixels.
-MAX_DEPTH_MAP_PIXELS = 160
-MIN_AGREEING = 1  # A depth is used if at least so many other photos see the point at the same depth.
+MAX_DEPTH_MAP_SIDE_PIXELS = 160
+MIN_AGREEING_PHOTOS = 1  # A depth is used if at least so many other photos see the point at the same depth.
 # A triangle of points with larger ratios of depths is taken for the gap between two surfaces.
 MAX_DEPTH_RATIO = 1.3
 
@@ -29,13 +32,13 @@ def draw_surface_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw points at random pixels of photos whose depth is known.
 
-    The depth of a pixel is that of a depth map (`estimate_depth_maps`) if at least MIN_AGREEING other photos agree.
-    Other pixels take it from the triangle of tracked points in which they lie (`interpolate_inverse_depths`), or are
-    left out, like masked and transparent ones. Points get the photo's colour.
+    The depth of a pixel is that of a depth map (`estimate_depth_maps`) if at least MIN_AGREEING_PHOTOS other photos
+    agree. Other pixels take it from the triangle of tracked points in which they lie (`interpolate_inverse_depths`), or
+    are left out, like masked and transparent ones. Points get the photo's colour.
 
     Args:
         scene: a scene with points. Without tracks, a photo counts as showing all points that lie in its picture.
-        cache: cache of decoded photos, of which at most MAX_PHOTOS are read.
+        cache: cache of decoded photos, of which at most MAX_PHOTOS are read, each twice unless the cache keeps it.
         count: number of points.
         generator: source of the random pixels.
 
@@ -46,75 +49,104 @@ def draw_surface_points(
     Raises:
         HyrfDataError: a photo cannot be read.
     """
-    views = evenly_spaced([view for view in scene.train if len(scene.shown_points(view))], MAX_PHOTOS)
-    photos, usable = [], []
+    if not scene.tracks and len(scene.points) > MAX_GUIDING_POINTS:
+        chosen = generator.choice(len(scene.points), MAX_GUIDING_POINTS, replace=False)
+        scene = replace(scene, points=scene.points[chosen], point_colors=scene.point_colors[chosen])
+    shown = {view.name: scene.shown_points(view) for view in scene.train}
+    views = evenly_spaced([view for view in scene.train if len(shown[view.name])], MAX_PHOTOS)
     with closing(cache.stream(views)) as pictures:
-        for view, picture in pictures:
-            photo, is_usable = _reduced_photo(view.camera, picture, scene.shown_points(view))
-            photos.append(photo)
-            usable.append(is_usable)
+        photos = [_reduced_photo(view.camera, picture, shown[view.name]) for view, picture in pictures]
     maps = estimate_depth_maps(photos, scene.points)
-    agreed = [_agreed_inverse_depths(maps, index, photo.grey.shape) for index, photo in enumerate(photos)]
     tracked = [scene.points[scene.tracks[view.name]] if scene.tracks else np.zeros((0, 3)) for view in views]
+    agreed = [_agreed_inverse_depths(maps, index, photo) for index, photo in enumerate(photos)]
     known = [
-        np.where(is_usable, np.where(inverse > 0, inverse, _interpolated(photo.camera, points)), 0)
-        for photo, is_usable, inverse, points in zip(photos, usable, agreed, tracked, strict=True)
+        np.where(photo.usable, np.where(own > 0, own, _interpolated(photo.camera, points)), 0)
+        for photo, own, points in zip(photos, agreed, tracked, strict=True)
     ]
-    shares = np.array([(inverse > 0).sum() for inverse in known], np.float64)
-    if not shares.sum():
+    pixel_counts = np.array([np.count_nonzero(inverse_depths) for inverse_depths in known], np.float64)
+    if not pixel_counts.sum():
         return np.zeros((0, 3)), np.zeros((0, 3))
-    drawn = generator.multinomial(count, shares / shares.sum())
-    positions, colors = [], []
+    shares = generator.multinomial(count, pixel_counts / pixel_counts.sum())
+    drawn = []
     with closing(cache.stream(views)) as pictures:
         for index, (view, picture) in enumerate(pictures):
-            row, column = np.nonzero(known[index])
-            chosen = generator.integers(len(row), size=drawn[index]) if drawn[index] else np.zeros(0, np.int64)
-            row, column = row[chosen], column[chosen]
-            pixels = (np.stack([column, row], 1) + generator.uniform(size=(len(row), 2))) * _reduction(view.camera)
-            inverse = known[index][row, column]
-            if len(tracked[index]):
-                exact = interpolate_inverse_depths(view.camera, tracked[index], pixels)
-                inverse = np.where((agreed[index][row, column] == 0) & (exact > 0), exact, inverse)
-            positions.append(view.camera.unproject(pixels[:, 0], pixels[:, 1], 1 / inverse))
-            x, y = pixels.astype(np.int64).T
-            colors.append(picture.rgb[y, x] / 255)
-    return np.concatenate(positions), np.concatenate(colors)
+            if shares[index]:
+                pixels, inverse_depths = _draw_pixels(
+                    view.camera, known[index], agreed[index] > 0, tracked[index], shares[index], generator
+                )
+                x, y = np.minimum(pixels.astype(np.int64), (view.camera.width - 1, view.camera.height - 1)).T
+                positions = view.camera.unproject(pixels[:, 0], pixels[:, 1], 1 / inverse_depths)
+                drawn.append((positions, picture.rgb[y, x] / 255))
+    positions, colors = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+    return positions, colors
+
+
+def _draw_pixels(
+    camera: Camera,
+    known: np.ndarray,
+    is_agreed: np.ndarray,
+    tracked: np.ndarray,
+    count: int,
+    generator: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw random pixels of a photo where the depth is known.
+
+    Args:
+        camera: the photo's camera.
+        known: (H, W) inverse depths of the reduced photo, 0 where they are not known.
+        is_agreed: (H, W) bool, where they come from the depth map; elsewhere they were interpolated.
+        tracked: (M, 3) tracked points that the photo shows, between which inverse depths are interpolated again, at the
+            pixels that are drawn.
+        count: number of pixels.
+        generator: source of random numbers.
+
+    Returns:
+        x and y in pixels (N, 2) and inverse depths (N,).
+    """
+    rows, columns = np.nonzero(known)
+    chosen = generator.integers(len(rows), size=count)
+    row, column = rows[chosen], columns[chosen]
+    pixels = (np.stack([column, row], 1) + generator.uniform(size=(count, 2))) * _reduction(camera)
+    inverse_depths = known[row, column]
+    if len(tracked):
+        interpolated = interpolate_inverse_depths(camera, tracked, pixels)
+        inverse_depths = np.where(~is_agreed[row, column] & (interpolated > 0), interpolated, inverse_depths)
+    return pixels, inverse_depths
 
 
 def _reduction(camera: Camera) -> int:
     """Return the factor by which a photo is reduced to estimate its depths."""
     shorter, longer = sorted((camera.width, camera.height))
-    return min(-(-longer // MAX_DEPTH_MAP_PIXELS), shorter)
+    return min(-(-longer // MAX_DEPTH_MAP_SIDE_PIXELS), shorter)
 
 
-def _reduced_photo(camera: Camera, picture: Picture, shown: np.ndarray) -> tuple[Photo, np.ndarray]:
-    """Reduce a photo to the size at which its depths are estimated.
+def _reduced_photo(camera: Camera, picture: Picture, shown: np.ndarray) -> Photo:
+    """Reduce a photo to the size at which its depths are estimated; transparent pixels become black.
 
-    Args:
-        camera, picture: the photo.
-        shown: indices of the points that it shows.
-
-    Returns:
-        The photo in grey, black where it is transparent, and which of its pixels (H, W) are neither masked nor
-        transparent.
+    A pixel is usable if none of the photo's pixels in it is masked or transparent.
     """
     factor = _reduction(camera)
-    reduced = reduce_picture(picture, factor)
+    usable = np.ones(picture.rgb.shape[:2], bool) if picture.mask is None else picture.mask
+    if picture.alpha is not None:
+        usable = usable & (picture.alpha == 255)
+    reduced = reduce_picture(replace(picture, mask=usable), factor)
+    assert reduced.mask is not None
     grey = reduced.rgb.mean(-1, dtype=np.float32) / np.float32(255)
-    usable = np.ones(grey.shape, bool) if reduced.mask is None else reduced.mask.copy()
     if reduced.alpha is not None:
         grey *= reduced.alpha / np.float32(255)
-        usable &= reduced.alpha == 255
-    return Photo(reduce_camera(camera, factor), grey, shown), usable
+    return Photo(reduce_camera(camera, factor), grey, reduced.mask, shown)
 
 
-def _agreed_inverse_depths(maps: Sequence[DepthMap | None], index: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the inverse depths (H, W) of a depth map, 0 where too few photos agree or the depth is not finite."""
+def _agreed_inverse_depths(maps: Sequence[InverseDepthMap | None], index: int, photo: Photo) -> np.ndarray:
+    """Return the inverse depths (H, W) of a depth map, 0 where too few photos agree.
+
+    Depths beyond the last plane before infinity are 0 as well: the background sphere shows them.
+    """
     depth_map = maps[index]
     if depth_map is None:
-        return np.zeros(shape)
-    enough = count_agreeing(maps, index) >= MIN_AGREEING
-    return np.where(enough & (depth_map.inverse > depth_map.spacing), depth_map.inverse, 0).astype(np.float64)
+        return np.zeros(photo.grey.shape)
+    is_near = depth_map.inverse_depths > depth_map.spacing
+    return np.where(is_near & (count_agreeing(maps, index) >= MIN_AGREEING_PHOTOS), depth_map.inverse_depths, 0)
 
 
 def _interpolated(camera: Camera, points: np.ndarray) -> np.ndarray:

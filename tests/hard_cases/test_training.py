@@ -163,8 +163,8 @@ def compress_and_decode(profile: str, trainer: Trainer) -> HybridModel:
 
 # Each start has a scene, the least gain over the best constant colour in dB, and the number of steps. The gain is at
 # most half of what was measured (a quarter for a single pixel). Most starts show a gain after 25 or 50 steps. Six are
-# trained for longer: without points the first Gaussians fill the box at random, and those in front delay the training;
-# clipped pictures, a black one among others and transparent pixels delay it too.
+# trained for longer: without points and depth maps the first Gaussians fill the box at random, and those in front delay
+# the training; clipped pictures, a black one among others and transparent pixels delay it too.
 BAD_STARTS = {
     "all points coincident": (lambda: scene_with_points(np.tile([0.1, 0.2, 0.3], (50, 1))), 1.2, 50),
     "one point": (lambda: scene_with_points([[0.0, 0.0, 0.0]]), 1.1, 50),

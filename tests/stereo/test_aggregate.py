@@ -8,9 +8,9 @@ import pytest
 from hyrfpack.stereo.aggregate import (
     DIRECTIONS,
     EDGE_CONTRAST,
-    JUMP_COST,
-    MIN_JUMP_RATIO,
-    STEP_COST,
+    LARGE_JUMP_PENALTY,
+    MIN_PENALTY_RATIO,
+    SMALL_JUMP_PENALTY,
     aggregate_costs,
 )
 
@@ -29,8 +29,8 @@ def reference(costs: np.ndarray, photo: np.ndarray) -> np.ndarray:
                 if 0 <= y - dy < height and 0 <= x - dx < width:
                     before = path[y - dy, x - dx]
                     contrast = abs(photo[y, x] - photo[y - dy, x - dx]) / EDGE_CONTRAST
-                    jump = max(JUMP_COST / (1 + contrast), MIN_JUMP_RATIO * STEP_COST)
-                    change = np.where(jumps == 0, 0, np.where(jumps == 1, min(STEP_COST, jump), jump))
+                    jump = max(LARGE_JUMP_PENALTY / (1 + contrast), MIN_PENALTY_RATIO * SMALL_JUMP_PENALTY)
+                    change = np.where(jumps == 0, 0, np.where(jumps == 1, min(SMALL_JUMP_PENALTY, jump), jump))
                     path[y, x] += (before[None] + change).min(1) - before.min()
         total += path
     return total

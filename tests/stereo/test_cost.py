@@ -7,7 +7,7 @@ import pytest
 from textured_planes import camera_at
 
 from hyrfpack.scene import Camera
-from hyrfpack.stereo.cost import sweep_costs
+from hyrfpack.stereo.cost import compute_cost_volume
 from hyrfpack.stereo.cost_kernels import NOISE_VARIANCE, WINDOW_RADIUS
 
 # Means of squares are rounded to 2^-24; in windows without texture they are divided by the noise alone.
@@ -23,7 +23,7 @@ def window_means(values: np.ndarray) -> np.ndarray:
 
 
 def reference_costs(camera: Camera, photo, others, inverses) -> np.ndarray:
-    """Compute `sweep_costs` in float64, each point through world coordinates; NaN where a pixel is near a border."""
+    """Do what `compute_cost_volume` does in float64, through world coordinates; NaN where a point is near a border."""
     photo = photo.astype(np.float64)
     y, x = (np.mgrid[: camera.height, : camera.width] + 0.5).reshape(2, -1)
     mean = window_means(photo)
@@ -68,6 +68,16 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     return Camera(width, height, camera.fx, camera.fy, width / 2, height / 2, camera.camera_from_world)
 
 
+def other_camera(camera: Camera) -> Camera:
+    """Return a camera of 21 x 19 pixels at the same place with another lens, rolled and pitched a little."""
+    roll, pitch = 0.2, 0.1
+    rolled = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
+    pitched = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])
+    pose = camera.camera_from_world.copy()
+    pose[:3] = rolled @ pitched @ pose[:3]
+    return Camera(21, 19, 22.0, 17.0, 9.0, 11.0, pose)
+
+
 CAMERAS = {
     "beside": [camera_at(0.3), camera_at(-0.2, 0.1)],
     "ahead": [camera_at(0.0, 0.0, 0.8)],
@@ -84,12 +94,13 @@ def test_costs_are_those_of_the_reference(name, size):
     generator = np.random.default_rng(0)
     camera = resized(camera_at(0.0), *size)
     photo = generator.random((size[1], size[0]), np.float32)
-    others = [(resized(other, 21, 19), generator.random((19, 21), np.float32)) for other in CAMERAS[name]]
+    others = [(other_camera(other), generator.random((19, 21), np.float32)) for other in CAMERAS[name]]
     inverses = np.array([0.0, 0.2, 0.9, 3.0])
-    costs = sweep_costs(camera, photo, others, inverses)
+    costs = compute_cost_volume(camera, photo, others, inverses)
     expected = reference_costs(camera, photo, others, inverses)
     assert costs.dtype == np.float32 and np.isfinite(costs).all()
     known = ~np.isnan(expected)
+    assert known.mean() > 0.9
     np.testing.assert_allclose(costs[known], expected[known], atol=ROUNDING)
 
 
@@ -97,8 +108,8 @@ def test_exposure_does_not_change_costs_much():
     generator = np.random.default_rng(1)
     photo, other = generator.random((2, 30, 40), np.float32)
     camera = resized(camera_at(0.0), 40, 30)
-    usual = sweep_costs(camera, photo, [(resized(camera_at(0.2), 40, 30), other)], np.array([0.3]))
-    darker = sweep_costs(camera, photo, [(resized(camera_at(0.2), 40, 30), 0.1 + 0.5 * other)], np.array([0.3]))
+    usual = compute_cost_volume(camera, photo, [(resized(camera_at(0.2), 40, 30), other)], np.array([0.3]))
+    darker = compute_cost_volume(camera, photo, [(resized(camera_at(0.2), 40, 30), 0.1 + 0.5 * other)], np.array([0.3]))
     assert np.abs(usual - darker).max() < 2e-3
 
 
@@ -107,5 +118,5 @@ def test_photos_without_texture_match_nowhere(grey):
     """Rounding of the windows' sums must not look like texture."""
     photo = np.full((20, 20), grey, np.float32)
     camera = resized(camera_at(0.0), 20, 20)
-    costs = sweep_costs(camera, photo, [(resized(camera_at(0.1), 20, 20), photo)], np.linspace(0, 1, 5))
+    costs = compute_cost_volume(camera, photo, [(resized(camera_at(0.1), 20, 20), photo)], np.linspace(0, 1, 5))
     assert costs.min() > 0.99

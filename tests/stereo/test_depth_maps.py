@@ -9,8 +9,9 @@ import pytest
 from textured_planes import camera_at, depths_of_planes, photograph
 
 from hyrfpack.stereo import Photo, count_agreeing, estimate_depth_maps
-from hyrfpack.stereo.depth_maps import PLANES
+from hyrfpack.stereo.depth_maps import PLANE_COUNT
 from hyrfpack.stereo.sources import MAX_SOURCES, choose_sources
+from hyrfpack.train.surface_points import MIN_AGREEING_PHOTOS
 
 WALL = (4.0, 0.0, -np.inf, np.inf)
 SLANTED = (4.0, 0.4, -np.inf, np.inf)
@@ -33,8 +34,9 @@ def photos_of(planes) -> tuple[list[Photo], np.ndarray]:
 
 
 @pytest.mark.parametrize("planes", [[WALL], [SLANTED], [WALL, BOARD]], ids=["wall", "slanted", "board"])
+@pytest.mark.parametrize("agreeing", [MIN_AGREEING_PHOTOS, 2])
 @pytest.mark.parametrize("unit", [1.0, 1e-4, 1e5])
-def test_depths_are_those_of_the_planes_in_any_unit(planes, unit):
+def test_depths_are_those_of_the_planes_in_any_unit(planes, unit, agreeing):
     photos, points = photos_of(planes)
     truth, _ = depths_of_planes(CAMERAS[0], planes)
     scaled = []
@@ -43,8 +45,8 @@ def test_depths_are_those_of_the_planes_in_any_unit(planes, unit):
         pose[:3, 3] *= unit
         scaled.append(dataclasses.replace(photo, camera=dataclasses.replace(photo.camera, camera_from_world=pose)))
     maps = estimate_depth_maps(scaled, unit * points)
-    agreed = count_agreeing(maps, 0) >= 2
-    errors = np.abs(maps[0].inverse - 1 / (unit * truth)) / maps[0].spacing
+    agreed = count_agreeing(maps, 0) >= agreeing
+    errors = np.abs(maps[0].inverse_depths - 1 / (unit * truth)) / maps[0].spacing
     assert agreed.mean() > 0.75
     assert np.quantile(errors[agreed], 0.9) < 1 and np.median(errors[agreed]) < 0.4
 
@@ -53,10 +55,10 @@ def test_exposure_does_not_change_depths():
     photos, points = photos_of([WALL, BOARD])
     darker = [dataclasses.replace(photo, grey=photo.grey * np.float32(0.4 + 0.1 * i)) for i, photo in enumerate(photos)]
     usual, changed = (estimate_depth_maps(some, points)[0] for some in (photos, darker))
-    assert (np.abs(usual.inverse - changed.inverse) < usual.spacing).mean() > 0.95
+    assert (np.abs(usual.inverse_depths - changed.inverse_depths) < usual.spacing).mean() > 0.95
 
 
-def test_a_moved_object_has_no_agreement():
+def test_fewer_photos_agree_about_an_object_that_moves():
     """The board stands elsewhere in each photo."""
     planes = [[WALL, (2.5, 0.0, -0.4 + shift, 0.4 + shift)] for shift in (0.0, 0.9, -0.9, 0.9, -0.9)]
     points = points_on([WALL])
@@ -88,10 +90,11 @@ def test_photos_that_share_no_points_have_no_depth_map():
 def test_depth_maps_are_finite_and_within_their_planes():
     generator = np.random.default_rng(0)
     _, points = photos_of([WALL])
-    photos = [Photo(camera, generator.random((48, 64), np.float32), np.arange(len(points))) for camera in CAMERAS]
+    usable, everything = np.ones((48, 64), bool), np.arange(len(points))
+    photos = [Photo(camera, generator.random((48, 64), np.float32), usable, everything) for camera in CAMERAS]
     for depth_map in estimate_depth_maps(photos, points):
-        assert depth_map.inverse.dtype == np.float64 and np.isfinite(depth_map.inverse).all()
-        assert depth_map.inverse.min() >= 0 and depth_map.inverse.max() <= PLANES * depth_map.spacing
+        assert depth_map.inverse_depths.dtype == np.float64 and np.isfinite(depth_map.inverse_depths).all()
+        assert depth_map.inverse_depths.min() >= 0 and depth_map.inverse_depths.max() <= PLANE_COUNT * depth_map.spacing
 
 
 def test_sources_share_points_and_see_them_from_about_five_degrees():
@@ -105,12 +108,27 @@ def test_sources_share_points_and_see_them_from_about_five_degrees():
     assert all(len(found) <= MAX_SOURCES for found in sources)
 
 
-@pytest.mark.parametrize("depth", [1e-300, 1e-30, 1e30, 1e100])
-def test_points_in_a_camera_or_very_far_away_do_no_harm(depth):
-    """Then all planes are far too near or far, products overflow, and no photo agrees."""
+def test_unusable_pixels_confirm_no_depth():
     photos, points = photos_of([WALL])
-    moved = points.copy()
-    moved[:, 2] = depth
-    for index, depth_map in enumerate(maps := estimate_depth_maps(photos, moved)):
+    masked = [dataclasses.replace(photo, usable=np.zeros_like(photo.usable)) for photo in photos[1:]]
+    assert count_agreeing(estimate_depth_maps(photos, points), 0).max() > 0
+    assert count_agreeing(estimate_depth_maps([photos[0], *masked], points), 0).max() == 0
+
+
+@pytest.mark.parametrize("depth", [1e-300, 1e-30])
+def test_points_in_a_camera_do_no_harm(depth):
+    """Then all planes are far too near, and products overflow."""
+    photos, points = photos_of([WALL])
+    points[:, 2] = depth
+    maps = estimate_depth_maps(photos, points)
+    assert any(maps)
+    for index, depth_map in enumerate(maps):
         if depth_map is not None:
-            assert np.isfinite(depth_map.inverse).all() and count_agreeing(maps, index).shape == (48, 64)
+            assert np.isfinite(depth_map.inverse_depths).all() and count_agreeing(maps, index).shape == (48, 64)
+
+
+@pytest.mark.parametrize("depth", [1e30, 1e100])
+def test_points_that_are_very_far_away_have_no_parallax(depth):
+    photos, points = photos_of([WALL])
+    points[:, 2] = depth
+    assert not any(estimate_depth_maps(photos, points))

@@ -161,6 +161,23 @@ def test_validation_photos_are_not_trained_on_and_lie_between_training_photos(vi
     assert all(min(abs(judge - n) for n in near) == 1 for judge in judges)
 
 
+@pytest.mark.parametrize("surface_points", [True, False])
+def test_pilots_start_as_the_run_does_unless_told_otherwise(monkeypatch, scores, surface_points):
+    settings: list[TrainConfig] = []
+
+    class Recorded(pilots.Trainer):  # this is the Trainer that `scores` has put there
+        def __init__(self, scene, config, cache, device):
+            super().__init__(scene, config, cache, device)
+            settings.append(config)
+
+    monkeypatch.setattr(pilots, "Trainer", Recorded)
+    scores[70] = 20.0
+    runs = ScenePilots(make_scene(), TrainConfig(surface_points=surface_points), PictureCache(), CPU_DEVICE)
+    runs.run("default", runs.fold(), 70, seed=0, exposure=False)
+    runs.run("points alone", runs.fold(), 70, seed=0, exposure=False, surface_points=False)
+    assert [config.surface_points for config in settings] == [surface_points, False]
+
+
 @pytest.mark.usefixtures("short_pilots")
 def test_pilots_are_deterministic_and_report_each_step():
     events: list[TaskEvent] = []

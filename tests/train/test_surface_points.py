@@ -160,26 +160,39 @@ def test_at_most_a_hundred_photos_are_read_once():
     assert len(points) == 1000 and len(set(read)) == len(read) == MAX_PHOTOS
 
 
-def plane_scene(unit: float = 1.0, **layers) -> Scene:
-    """Return photos of a wall with a board before it from five places, without tracks; points on the wall alone."""
+def plane_scene(unit: float = 1.0, *, enlarged: int = 1, cut: int = 0, **layers) -> Scene:
+    """Return photos of a wall with a board before it from five places, without tracks; points on the wall alone.
+
+    The photos of the first, third and fifth place lack `cut` columns and rows, after each pixel has become `enlarged` x
+    `enlarged` pixels.
+    """
     planes = [(4.0, 0.0, -np.inf, np.inf), (2.5, 0.0, -0.4, 0.4)]
     views, points = [], np.zeros((0, 3))
     for number, place in enumerate([(0.0, 0.0), (0.35, 0.05), (-0.35, 0.0), (0.1, 0.35), (0.0, -0.35)]):
         camera = plane_camera_at(*place)
         _, grey = depths_of_planes(camera, planes)
-        picture = Picture(np.repeat((255 * grey).astype(np.uint8)[..., None], 3, 2), **layers)
+        pixels = np.repeat((255 * grey).astype(np.uint8)[..., None], 3, 2)
+        pixels = pixels.repeat(enlarged, 0).repeat(enlarged, 1)
+        less = cut * (number % 2 == 0)
+        pixels = pixels[: len(pixels) - less, : pixels.shape[1] - less]
         pose = camera.camera_from_world.copy()
         pose[:3, 3] *= unit
-        views.append(view_of(f"{number}.png", dataclasses.replace(camera, camera_from_world=pose), picture))
+        height, width = pixels.shape[:2]
+        lens = (enlarged * value for value in camera.intrinsics)
+        views.append(view_of(f"{number}.png", Camera(width, height, *lens, pose), Picture(pixels, **layers)))
         if not number:
             places = np.random.default_rng(0).uniform(size=(40, 2)) * (camera.width, camera.height)
             points = unit * points_at(places, [4.0] * 40, camera)
     return Scene("planes", "nerfstudio", views, [], points, np.full((len(points), 3), 0.5, np.float32))
 
 
-@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e4])
-def test_points_lie_on_surfaces_that_have_no_points_of_the_scene(unit):
-    points, colors = draw_surface_points(plane_scene(unit), PictureCache(), 2000, np.random.default_rng(0))
+@pytest.mark.parametrize(
+    ("unit", "layout"),
+    [(1.0, {}), (1e-3, {}), (1e4, {}), (1.0, {"enlarged": 3}), (1.0, {"enlarged": 4, "cut": 3})],
+    ids=["usual", "small unit", "large unit", "large photos", "two sizes, not multiples of the factor"],
+)
+def test_points_lie_on_surfaces_that_have_no_points_of_the_scene(unit, layout):
+    points, colors = draw_surface_points(plane_scene(unit, **layout), PictureCache(), 2000, np.random.default_rng(0))
     x, _, z = (points / unit).T
     on_board, on_wall = np.abs(z - 2.5) < 0.15, np.abs(z - 4) < 0.3
     assert len(points) == 2000 and (on_board | on_wall).mean() > 0.9
@@ -187,7 +200,33 @@ def test_points_lie_on_surfaces_that_have_no_points_of_the_scene(unit):
     assert 0 <= colors.min() < 0.3 and 0.7 < colors.max() <= 1
 
 
-def test_without_points_guesses_only_say_how_near_surfaces_can_be():
+@pytest.mark.parametrize("layer", ["alpha", "mask"])
+def test_unusable_pixels_of_large_photos_give_no_points(layer):
+    """One transparent pixel in each block of four makes the block unusable, though its mean alpha rounds to 255."""
+    shown = np.zeros((96, 128), bool)
+    shown[:, :64] = True
+    shown[::2, 32::2] = False
+    layers = {"mask": shown} if layer == "mask" else {"alpha": np.where(shown, 255, 254).astype(np.uint8)}
+    scene = plane_scene(enlarged=2, **layers)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(surface_points, "MAX_DEPTH_MAP_SIDE_PIXELS", 64)
+        points, _ = draw_surface_points(scene, PictureCache(), 500, np.random.default_rng(0))
+    assert len(points) == 500
+    columns = [view.camera.project(points)[0] for view in scene.train]
+    assert (np.min(columns, axis=0) < 32).all()  # each point is drawn from one of the photos, left of its column 32
+
+
+def test_many_points_without_tracks_are_a_guide_as_good_as_few():
+    scene = plane_scene()
+    many = np.repeat(scene.points, 300, axis=0)
+    assert len(many) > surface_points.MAX_GUIDING_POINTS
+    scene = dataclasses.replace(scene, points=many, point_colors=np.full((len(many), 3), 0.5, np.float32))
+    points, _ = draw_surface_points(scene, PictureCache(), 300, np.random.default_rng(0))
+    z = points[:, 2]
+    assert ((np.abs(z - 2.5) < 0.15) | (np.abs(z - 4) < 0.3)).mean() > 0.9
+
+
+def test_without_points_random_ones_guide_the_depth_maps():
     """Random points in the box take the place of the scene's points."""
     scene = dataclasses.replace(plane_scene(), points=np.zeros((0, 3)), point_colors=np.zeros((0, 3), np.float32))
     frame = Frame.from_box(np.array([-3.0, -2.0, 1.0]), np.array([3.0, 2.0, 5.0]))
