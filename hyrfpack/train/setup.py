@@ -212,7 +212,7 @@ def initial_points(
 
     They are the scene's points, or a random subset of them. If there are fewer than the budget, `draw_surface_points`
     adds others from photos read by `cache`; None adds none. A scene without points starts from points on surfaces
-    alone. Where none are found it starts from random points in the box, half as many as the budget; if photos have
+    alone. Where these are fewer than half of the budget, random points in the box make up the rest; if photos have
     transparency, these lie in the visual hull. Outliers are moved along the line to the frame's centre until half
     precision can represent their coordinates.
 
@@ -243,9 +243,14 @@ def initial_points(
         # Random points take the place of the scene's: they tell which photos show the same place, and how near surfaces
         # can be.
         guesses = replace(scene, points=frame.to_world(points), point_colors=colors.astype(np.float32), tracks={})
-        found, found_colors = draw_surface_points(guesses, cache, budget, generator)
-        if len(found):
-            return _representable(frame.to_local(found)), found_colors, "on surfaces that photos show"
+        more, more_colors = draw_surface_points(guesses, cache, budget, generator)
+        missing = max(0, count - len(more))
+        points = np.concatenate([_representable(frame.to_local(more)), points[:missing]])
+        colors = np.concatenate([more_colors, colors[:missing]])
+        if not missing:
+            source = "on surfaces that photos show"
+        elif len(more):
+            source = f"{len(more):,} on surfaces that photos show, the others {source}"
     return points, colors, source
 
 

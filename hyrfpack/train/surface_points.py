@@ -22,6 +22,7 @@ MAX_PHOTOS = 100  # More photos are not read: they show the same surfaces.
 MAX_GUIDING_POINTS = 10_000
 # Depths are estimated from photos whose longer side has at most this many pixels.
 MAX_DEPTH_MAP_SIDE_PIXELS = 160
+MAX_POINTS_PER_PIXEL = 4  # of a depth map, so that a few false depths do not get all points
 MIN_AGREEING_PHOTOS = 1  # A depth is used if at least so many other photos see the point at the same depth.
 # A triangle of points with larger ratios of depths is taken for the gap between two surfaces.
 MAX_DEPTH_RATIO = 1.3
@@ -43,8 +44,8 @@ def draw_surface_points(
         generator: source of the random pixels.
 
     Returns:
-        World positions (N, 3) float64 and colours (N, 3) float64 in [0, 1], where N is `count`, or 0 if no depth is
-        known.
+        World positions (N, 3) float64 and colours (N, 3) float64 in [0, 1]. N is `count`, or MAX_POINTS_PER_PIXEL times
+        the number of pixels of known depth if that is less.
 
     Raises:
         HyrfDataError: a photo cannot be read.
@@ -66,6 +67,7 @@ def draw_surface_points(
     pixel_counts = np.array([np.count_nonzero(inverse_depths) for inverse_depths in known], np.float64)
     if not pixel_counts.sum():
         return np.zeros((0, 3)), np.zeros((0, 3))
+    count = min(count, MAX_POINTS_PER_PIXEL * int(pixel_counts.sum()))
     shares = generator.multinomial(count, pixel_counts / pixel_counts.sum())
     drawn = []
     with closing(cache.stream(views)) as pictures:

@@ -83,7 +83,9 @@ def test_points_are_spread_evenly_over_the_triangles():
     """A quarter of a wall is a triangle fan of many points, the rest two large triangles."""
     fine = [(x, y) for x in np.linspace(0, 20, 9) for y in np.linspace(0, 15, 9)]
     points = points_at([*fine, (39.9, 0), (0, 29.9), (39.9, 29.9)], [2.0] * (len(fine) + 3))
-    drawn, _ = draw_surface_points(scene_of([flat_photo()], points), PictureCache(), 20_000, np.random.default_rng(0))
+    drawn, _ = draw_surface_points(
+        scene_of([flat_photo()] * 8, points), PictureCache(), 20_000, np.random.default_rng(0)
+    )
     x, y, _ = SMALL_CAMERA.project(drawn)
     counts, _, _ = np.histogram2d(x, y, bins=4, range=[(0, 39.9), (0, 29.9)])
     np.testing.assert_allclose(counts, 20_000 / 16, rtol=0.15)
@@ -234,6 +236,20 @@ def test_without_points_random_ones_guide_the_depth_maps():
     z = frame.to_world(positions)[:, 2]
     assert source == "on surfaces that photos show" and positions.shape == colors.shape == (500, 3)
     assert ((np.abs(z - 2.5) < 0.2) | (np.abs(z - 4) < 0.4)).mean() > 0.8
+
+
+def test_random_points_make_up_the_rest_where_few_depths_are_known():
+    """Else a few pixels, whose depths may be wrong, would get all points."""
+    mask = np.zeros((48, 64), bool)
+    mask[20:23] = True
+    scene = plane_scene(mask=mask)
+    drawn, _ = draw_surface_points(scene, PictureCache(), 5000, np.random.default_rng(0))
+    assert 0 < len(drawn) <= 4 * mask.sum() * len(scene.train)
+    scene = dataclasses.replace(scene, points=np.zeros((0, 3)), point_colors=np.zeros((0, 3), np.float32))
+    frame = Frame.from_box(np.array([-3.0, -2.0, 1.0]), np.array([3.0, 2.0, 5.0]))
+    positions, colors, source = initial_points(scene, frame, 20_000, 0, PictureCache())
+    assert positions.shape == colors.shape == (10_000, 3)
+    assert source.endswith(" on surfaces that photos show, the others random, in the box")
 
 
 def tracked_balls(points: int = 300) -> Scene:
