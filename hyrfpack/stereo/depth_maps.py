@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hyrfpack.scene import Camera
-from hyrfpack.stereo.aggregate import aggregate_costs
-from hyrfpack.stereo.cost import compute_cost_volume
 from hyrfpack.stereo.sources import choose_sources
 
 PLANE_COUNT = 64
@@ -69,12 +67,18 @@ def estimate_depth_maps(photos: Sequence[Photo], points: np.ndarray) -> list[Inv
 
     Returns:
         N depth maps; None for a photo that shows no point, or for which there are no suitable source photos.
+
+    Raises:
+        ImportError: Numba is missing.
     """
     sources = choose_sources([photo.camera for photo in photos], points, [photo.points for photo in photos])
     return [_estimate(photo, points, photos, near) for photo, near in zip(photos, sources, strict=True)]
 
 
 def _estimate(photo: Photo, points: np.ndarray, photos: Sequence[Photo], sources: list[int]) -> InverseDepthMap | None:
+    from hyrfpack.stereo.aggregate import aggregate_costs  # Compiled code, without which a model can be packed.
+    from hyrfpack.stereo.cost import compute_cost_volume
+
     _, _, z = photo.camera.project(points[photo.points])
     z = z[z > 0]
     if not len(z) or not sources:

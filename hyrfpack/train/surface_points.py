@@ -14,6 +14,7 @@ from scipy.spatial import Delaunay, QhullError
 
 from hyrfpack.data.cache import PictureCache
 from hyrfpack.data.reduced import reduce_camera, reduce_picture
+from hyrfpack.parallel import has_numba
 from hyrfpack.scene import Camera, Picture, Scene, evenly_spaced
 from hyrfpack.stereo import InverseDepthMap, Photo, count_agreeing, estimate_depth_maps
 
@@ -35,7 +36,8 @@ def draw_surface_points(
 
     The depth of a pixel is that of a depth map (`estimate_depth_maps`) if at least MIN_AGREEING_PHOTOS other photos
     agree. Other pixels take it from the triangle of tracked points in which they lie (`interpolate_inverse_depths`), or
-    are left out, like masked and transparent ones. Points get the photo's colour.
+    are left out, like masked and transparent ones. Points get the photo's colour. Without Numba there are no depth
+    maps.
 
     Args:
         scene: a scene with points. Without tracks, a photo counts as showing all points that lie in its picture.
@@ -57,7 +59,7 @@ def draw_surface_points(
     views = evenly_spaced([view for view in scene.train if len(shown[view.name])], MAX_PHOTOS)
     with closing(cache.stream(views)) as pictures:
         photos = [_reduced_photo(view.camera, picture, shown[view.name]) for view, picture in pictures]
-    maps = estimate_depth_maps(photos, scene.points)
+    maps = estimate_depth_maps(photos, scene.points) if has_numba() else [None] * len(photos)
     tracked = [scene.points[scene.tracks[view.name]] if scene.tracks else np.zeros((0, 3)) for view in views]
     agreed = [_agreed_inverse_depths(maps, index, photo) for index, photo in enumerate(photos)]
     known = [
@@ -131,7 +133,9 @@ def _reduced_photo(camera: Camera, picture: Picture, shown: np.ndarray) -> Photo
     usable = np.ones(picture.rgb.shape[:2], bool) if picture.mask is None else picture.mask
     if picture.alpha is not None:
         usable = usable & (picture.alpha == 255)
-    reduced = reduce_picture(replace(picture, mask=usable), factor)
+    reduced = replace(picture, mask=usable)
+    if factor > 1:
+        reduced = reduce_picture(reduced, factor)
     assert reduced.mask is not None
     grey = reduced.rgb.mean(-1, dtype=np.float32) / np.float32(255)
     if reduced.alpha is not None:

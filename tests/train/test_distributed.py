@@ -26,6 +26,7 @@ from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
 from hyrfpack.train.optimizer import Optimizer
+from hyrfpack.train.setup import build_model
 from hyrfpack.train.trainer import shuffled
 
 WORLD_SIZE = 2
@@ -208,7 +209,9 @@ def test_gains_agree_on_both_ranks_also_where_both_render_the_same_photo(outcome
 def test_ranks_together_follow_the_view_order_of_one_process(size, steps):
     config = dataclasses.replace(tasks.SIX_PHOTO_CONFIG, steps=7)
     ranks = [dataclasses.replace(SINGLE_PROCESS, rank=rank, size=size) for rank in range(size)]
-    trainers = [Trainer(tasks.six_photo_scene(), config, ranks=rank) for rank in ranks]
+    scene = tasks.six_photo_scene()
+    model, _, _ = build_model(scene, config)  # Else ranks would communicate while they make their models.
+    trainers = [Trainer(scene, config, model=model, ranks=rank) for rank in ranks]
     orders = [[view.name for view in trainer._order()] for trainer in trainers]
     assert {trainer.steps for trainer in trainers} == {steps}
     names = [name for step in zip(*orders, strict=True) for name in step]
