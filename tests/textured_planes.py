@@ -7,7 +7,7 @@ import numpy as np
 from hyrfpack.scene import Camera
 from hyrfpack.stereo import Photo
 
-WIDTH, HEIGHT = 64, 48
+PICTURE_WIDTH, PICTURE_HEIGHT = 64, 48
 
 
 def camera_at(x: float, y: float = 0.0, z: float = 0.0, turn: float = 0.0) -> Camera:
@@ -16,7 +16,7 @@ def camera_at(x: float, y: float = 0.0, z: float = 0.0, turn: float = 0.0) -> Ca
     rotation = np.array([[c, 0, -s], [0, 1, 0], [s, 0, c]])
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, -rotation @ (x, y, z)
-    return Camera(WIDTH, HEIGHT, 60.0, 60.0, WIDTH / 2, HEIGHT / 2, pose)
+    return Camera(PICTURE_WIDTH, PICTURE_HEIGHT, 60.0, 60.0, PICTURE_WIDTH / 2, PICTURE_HEIGHT / 2, pose)
 
 
 def texture(x: np.ndarray, y: np.ndarray, seed: int = 0) -> np.ndarray:

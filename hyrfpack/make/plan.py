@@ -161,7 +161,7 @@ def estimate_seconds(
     Args:
         size: size of the photos.
         plan: the plan.
-        gaussians: expected number of Gaussians, at the start and at the end.
+        gaussians: expected number of Gaussians; training starts with at most as many.
         held_out: number of photos that are scored.
         pilot_steps: number of steps of all pilot runs, see `max_pilot_steps`.
         device: device of the training.

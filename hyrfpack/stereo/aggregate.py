@@ -14,7 +14,8 @@ LARGE_JUMP_PENALTY = 1.2
 # MIN_PENALTY_RATIO times that on small jumps.
 EDGE_CONTRAST = 0.04
 MIN_PENALTY_RATIO = 1.5
-DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
+# Steps from one pixel of a path to the next: rows down, columns right.
+PATH_STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 _MIN_LINES_PER_RANGE = 16
 _kernel = compiled(fastmath={"contract", "nsz"}, error_model="numpy")
 
@@ -77,7 +78,7 @@ def aggregate_costs(costs: np.ndarray, photo: np.ndarray) -> np.ndarray:
         (H, W, P) float32. The smallest sum of a pixel marks its depth.
     """
     total = np.zeros_like(costs)
-    for dy, dx in DIRECTIONS:
+    for dy, dx in PATH_STEPS:
         _add_paths(dy, dx, costs, photo, total)
     return total
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from hyrfpack.stereo.aggregate import (
-    DIRECTIONS,
     EDGE_CONTRAST,
     LARGE_JUMP_PENALTY,
     MIN_PENALTY_RATIO,
+    PATH_STEPS,
     SMALL_JUMP_PENALTY,
     aggregate_costs,
 )
@@ -21,7 +21,7 @@ def reference(costs: np.ndarray, photo: np.ndarray) -> np.ndarray:
     height, width, planes = costs.shape
     jumps = np.abs(np.subtract.outer(np.arange(planes), np.arange(planes)))
     total = np.zeros_like(costs)
-    for dy, dx in DIRECTIONS:
+    for dy, dx in PATH_STEPS:
         path = np.zeros_like(costs)
         for y in range(height)[:: 1 if dy >= 0 else -1]:
             for x in range(width)[:: 1 if dx >= 0 else -1]:

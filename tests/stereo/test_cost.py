@@ -11,7 +11,7 @@ from hyrfpack.stereo.cost import compute_cost_volume
 from hyrfpack.stereo.cost_kernels import NOISE_VARIANCE, WINDOW_RADIUS
 
 # Means of squares are rounded to 2^-24; in windows without texture they are divided by the noise alone.
-ROUNDING = 2**-24 / NOISE_VARIANCE
+MAX_ROUNDING_ERROR = 2**-24 / NOISE_VARIANCE
 
 
 def window_means(values: np.ndarray) -> np.ndarray:
@@ -78,7 +78,7 @@ def other_camera(camera: Camera) -> Camera:
     return Camera(21, 19, 22.0, 17.0, 9.0, 11.0, pose)
 
 
-CAMERAS = {
+CAMERAS_BY_CASE = {
     "beside": [camera_at(0.3), camera_at(-0.2, 0.1)],
     "ahead": [camera_at(0.0, 0.0, 0.8)],
     "turned": [camera_at(0.5, turn=-0.3), camera_at(-0.5, turn=0.3), camera_at(0.1), camera_at(0.0, 0.4)],
@@ -89,19 +89,19 @@ CAMERAS = {
 
 
 @pytest.mark.parametrize("size", [(23, 17), (7, 7), (6, 4), (3, 9), (1, 1)], ids=str)
-@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("name", CAMERAS_BY_CASE)
 def test_costs_are_those_of_the_reference(name, size):
     generator = np.random.default_rng(0)
     camera = resized(camera_at(0.0), *size)
     photo = generator.random((size[1], size[0]), np.float32)
-    others = [(other_camera(other), generator.random((19, 21), np.float32)) for other in CAMERAS[name]]
+    others = [(other_camera(other), generator.random((19, 21), np.float32)) for other in CAMERAS_BY_CASE[name]]
     inverses = np.array([0.0, 0.2, 0.9, 3.0])
     costs = compute_cost_volume(camera, photo, others, inverses)
     expected = reference_costs(camera, photo, others, inverses)
     assert costs.dtype == np.float32 and np.isfinite(costs).all()
     known = ~np.isnan(expected)
     assert known.mean() > 0.9
-    np.testing.assert_allclose(costs[known], expected[known], atol=ROUNDING)
+    np.testing.assert_allclose(costs[known], expected[known], atol=MAX_ROUNDING_ERROR)
 
 
 def test_exposure_does_not_change_costs_much():

@@ -162,7 +162,7 @@ def test_validation_photos_are_not_trained_on_and_lie_between_training_photos(vi
 
 
 @pytest.mark.parametrize("surface_points", [True, False])
-def test_pilots_start_as_the_run_does_unless_told_otherwise(monkeypatch, scores, surface_points):
+def test_pilots_start_as_the_run_does_by_default(monkeypatch, scores, surface_points):
     settings: list[TrainConfig] = []
 
     class Recorded(pilots.Trainer):  # this is the Trainer that `scores` has put there
