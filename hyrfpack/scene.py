@@ -129,6 +129,10 @@ class Camera:
         with np.errstate(divide="ignore", invalid="ignore"):
             return self.fx * x / z + self.cx, self.fy * y / z + self.cy, z
 
+    def in_picture(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Return which of the points that `project` gave lie in front of the camera and in the picture, (N,) bool."""
+        return np.asarray((z > 0) & (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height))
+
     def unproject(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Return the world points (N, 3) at x and y in pixels and camera z in world units: the inverse of `project`."""
         seen = np.stack(((x - self.cx) / self.fx * z, (y - self.cy) / self.fy * z, z), axis=1)
@@ -278,9 +282,7 @@ class Scene:
         """
         if self.tracks:
             return self.tracks.get(view.name, np.zeros(0, np.int64))
-        camera = view.camera
-        x, y, z = camera.project(self.points)
-        return np.flatnonzero((z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))
+        return np.flatnonzero(view.camera.in_picture(*view.camera.project(self.points)))
 
 
 def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:

@@ -40,6 +40,14 @@ def test_project_agrees_with_the_pinhole_equation_and_marks_points_behind():
     np.testing.assert_allclose(y[:2], [2.5, 2.5 - 12 * 0.5 / 5])
 
 
+def test_points_on_the_left_and_upper_border_are_in_the_picture_and_those_on_the_others_are_not():
+    camera = Camera(8, 6, 5.0, 5.0, 4.0, 3.0, np.eye(4))
+    x = np.array([0.0, 8.0, 4.0, 4.0, -1e-9, 4.0, np.nan])
+    y = np.array([0.0, 3.0, 6.0, 3.0, 3.0, 3.0, 3.0])
+    z = np.array([1.0, 1.0, 1.0, -1.0, 1.0, 1e-9, 1.0])
+    assert camera.in_picture(x, y, z).tolist() == [True, False, False, False, False, True, False]
+
+
 def test_unproject_inverts_project():
     camera = Camera(8, 6, 10.0, 12.0, 3.5, 2.5, look_at((0.4, -3.0, 1.0), (0, 0, 0)))
     points = np.random.default_rng(0).uniform(-1, 1, (20, 3))

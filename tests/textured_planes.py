@@ -52,5 +52,5 @@ def photograph(camera: Camera, planes, points: np.ndarray) -> Photo:
     """
     _, grey = depths_of_planes(camera, planes)
     x, y, z = camera.project(points)
-    shown = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    return Photo(camera, grey.astype(np.float32), np.ones(grey.shape, bool), np.flatnonzero(shown))
+    shown = np.flatnonzero(camera.in_picture(x, y, z))
+    return Photo(camera, grey.astype(np.float32), np.ones(grey.shape, bool), shown)

@@ -161,7 +161,7 @@ def _share_in_front(
         assert rendering.depth is not None
         surface = torch.where(rendering.alpha < MIN_SURFACE_ALPHA, torch.inf, rendering.depth).numpy()
         x, y, z = camera.project(positions)
-        inside = np.flatnonzero((z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))
+        inside = np.flatnonzero(camera.in_picture(x, y, z))
         depths, behind = z[inside], surface[y[inside].astype(np.int64), x[inside].astype(np.int64)]
         in_front[inside] += depths < (1 - MIN_GAP) * behind
         seen[inside] += depths < (1 + MIN_GAP) * behind

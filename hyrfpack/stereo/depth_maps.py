@@ -123,7 +123,7 @@ def count_agreeing(maps: Sequence[InverseDepthMap | None], index: int) -> np.nda
             continue
         camera = other.photo.camera
         u, v, depth = camera.project(points)
-        inside = np.flatnonzero((depth > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height))
+        inside = np.flatnonzero(camera.in_picture(u, v, depth))
         row, column = v[inside].astype(np.int64), u[inside].astype(np.int64)
         difference = np.abs(other.inverse_depths[row, column] - 1 / depth[inside])
         agrees = other.photo.usable[row, column] & (difference <= MAX_DIFFERENCE_PLANES * other.spacing)

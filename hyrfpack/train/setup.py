@@ -240,7 +240,7 @@ def initial_points(
         points, colors = generator.uniform(-half, half, (count, 3)), np.full((count, 3), 0.5)
         source = "random, in the box"
     if cache is not None:
-        # Random points take the place of the scene's: they tell which photos show the same place, and how near surfaces
+        # Random points take the place of the scene's: they say which photos show the same place, and how near surfaces
         # can be.
         guesses = replace(scene, points=frame.to_world(points), point_colors=colors.astype(np.float32), tracks={})
         more, more_colors = draw_surface_points(guesses, cache, budget, generator)

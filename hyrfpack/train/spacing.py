@@ -37,7 +37,7 @@ def gaussian_spacing(model: HybridModel, views: Sequence[View], count: int) -> f
     distances = [np.zeros(0)]
     for camera in (view.camera for view in evenly_spaced(views, MAX_MEASURED_VIEWS)):
         x, y, z = camera.project(points)
-        is_shown = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        is_shown = camera.in_picture(x, y, z)
         if is_shown.any():
             shown = is_shown.mean() * count
             pixels = np.sqrt(camera.width * camera.height / shown)

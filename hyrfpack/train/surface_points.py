@@ -19,7 +19,7 @@ from hyrfpack.scene import Camera, Picture, Scene, evenly_spaced
 from hyrfpack.stereo import InverseDepthMap, Photo, count_agreeing, estimate_depth_maps
 
 MAX_PHOTOS = 100  # More photos are not read: they show the same surfaces.
-# Without tracks, points only tell which photos show the same place, and how near surfaces can be.
+# Without tracks, points only say which photos show the same place, and how near surfaces can be.
 MAX_GUIDING_POINTS = 10_000
 # Depths are estimated from photos whose longer side has at most this many pixels.
 MAX_DEPTH_MAP_SIDE_PIXELS = 160
@@ -176,7 +176,7 @@ def interpolate_inverse_depths(camera: Camera, points: np.ndarray, pixels: np.nd
         (N,) 1 / z in inverse world units, 0 outside all triangles.
     """
     x, y, z = camera.project(points)
-    shown = (z > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    shown = camera.in_picture(x, y, z)
     places, inverse = np.stack([x, y], 1)[shown], 1 / z[shown]
     if len(places) < 3:
         return np.zeros(len(pixels))
