@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from hyrfpack.scene import Camera
-from hyrfpack.stereo.cost_kernels import combine_costs, compare_on_planes, window_means
+from hyrfpack.stereo.cost_kernels import compare_on_planes
 
 
 def compute_cost_volume(
@@ -29,15 +29,13 @@ def compute_cost_volume(
     Returns:
         Costs (H, W, P) float32 in [0, 1]; 1 where no other photo shows the point.
     """
-    mean = window_means(photo)
-    variance = np.maximum(window_means(photo * photo) - mean * mean, 0)
-    inverse_depths, costs = np.asarray(inverse_depths, np.float64), []
-    for other, grey in others:
+    homographies, offsets = [], []
+    for other, _ in others:
         relative = other.camera_from_world @ np.linalg.inv(camera.camera_from_world)
-        homography = _intrinsic_matrix(other) @ relative[:3, :3] @ np.linalg.inv(_intrinsic_matrix(camera))
-        offset = _intrinsic_matrix(other) @ relative[:3, 3]
-        costs.append(compare_on_planes(photo, mean, variance, grey, homography, offset, inverse_depths))
-    return combine_costs(np.stack(costs))
+        homographies.append(_intrinsic_matrix(other) @ relative[:3, :3] @ np.linalg.inv(_intrinsic_matrix(camera)))
+        offsets.append(_intrinsic_matrix(other) @ relative[:3, 3])
+    planes = np.asarray(inverse_depths, np.float64)
+    return compare_on_planes(photo, [grey for _, grey in others], np.stack(homographies), np.stack(offsets), planes)
 
 
 def _intrinsic_matrix(camera: Camera) -> np.ndarray:
