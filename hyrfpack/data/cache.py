@@ -9,8 +9,12 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
 from threading import Lock
+from typing import Any, TypeVar
 
 from hyrfpack.scene import Picture, View
+
+Owner = TypeVar("Owner")
+Result = TypeVar("Result")
 
 PREFETCH_DEPTH = 4  # By default so many pictures are decoded in advance.
 
@@ -33,6 +37,7 @@ class PictureCache:
         self.nbytes = 0
         self._pictures: OrderedDict[Callable[[], Picture], Picture] = OrderedDict()
         self._lock = Lock()
+        self._derived: tuple[Callable, object, Any] | None = None
 
     def get(self, view: View) -> Picture:
         """Return the view's picture, and decode it if it is not cached. Raises what `view.load` raises."""
@@ -51,11 +56,27 @@ class PictureCache:
                     self.nbytes -= self._pictures.popitem(last=False)[1].nbytes
         return picture
 
+    def derive(self, function: Callable[[Owner, PictureCache], Result], owner: Owner) -> Result:
+        """Return `function(owner, self)`, and keep the result for another call with the same arguments.
+
+        Only the last result is kept; its memory is not part of the limit. Threads may not share this method.
+
+        Args:
+            function: computes a result from pictures of the owner.
+            owner: what the pictures belong to, such as a scene. Another object that is equal counts as another owner.
+        """
+        if self._derived is None or self._derived[0] is not function or self._derived[1] is not owner:
+            self._derived = None  # frees its memory
+            self._derived = (function, owner, function(owner, self))
+        result: Result = self._derived[2]
+        return result
+
     def clear(self) -> None:
-        """Forget all pictures, so that their memory is free for other work."""
+        """Forget all pictures and the derived result, so that their memory is free for other work."""
         with self._lock:
             self._pictures.clear()
             self.nbytes = 0
+        self._derived = None
 
     def stream(self, views: Iterable[View], depth: int = PREFETCH_DEPTH) -> Generator[tuple[View, Picture]]:
         """Yield each view with its picture, while another thread decodes the next pictures.

@@ -56,6 +56,31 @@ def test_the_limit_is_kept_by_dropping_the_least_recently_used_picture():
     assert [view.load.loads for view in (a, b, c)] == [1, 2, 1]
 
 
+def test_the_last_derived_result_is_kept():
+    (view,), cache, calls = make_views(CountedPhoto(7)), PictureCache(), []
+
+    def brightness(views, cache):
+        calls.append(views)
+        return cache.get(views[0]).rgb.mean()
+
+    def half_brightness(views, cache):
+        return brightness(views, cache) / 2
+
+    scene, equal = [view], [view]
+    assert [cache.derive(brightness, owner) for owner in (scene, scene, equal, equal, scene)] == [7] * 5
+    assert len(calls) == 3
+    assert cache.derive(half_brightness, scene) == 3.5
+    cache.clear()
+    assert cache.derive(half_brightness, scene) == 3.5 and len(calls) == 5
+
+
+def test_a_failed_derivation_keeps_nothing():
+    (view,), cache = make_views(CountedPhoto(7, fails=True)), PictureCache()
+    for _ in range(2):
+        with pytest.raises(HyrfDataError, match="missing"):
+            cache.derive(lambda owner, cache: cache.get(owner), view)
+
+
 def test_picture_above_the_limit_is_not_kept():
     (view,) = make_views(CountedPhoto(1))
     cache = PictureCache(100)

@@ -11,7 +11,7 @@ from textured_planes import camera_at, depths_of_planes, photograph
 from hyrfpack.stereo import Photo, count_agreeing, estimate_depth_maps
 from hyrfpack.stereo.depth_maps import PLANE_COUNT
 from hyrfpack.stereo.sources import MAX_SOURCES, choose_sources
-from hyrfpack.train.surface_points import MIN_AGREEING_PHOTOS
+from hyrfpack.train.surface_depths import MIN_AGREEING_PHOTOS
 
 WALL_PLANE = (4.0, 0.0, -np.inf, np.inf)
 SLANTED_PLANE = (4.0, 0.4, -np.inf, np.inf)

@@ -1,4 +1,4 @@
-"""hyrfpack.train.surface_points: depths on planes and across jumps, colours, hard cases, and the first model."""
+"""Initial points on surfaces: depths on planes and across jumps, colours, hard cases, and the first model."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from hyrfpack.config.train import TrainConfig
 from hyrfpack.data.cache import PictureCache
 from hyrfpack.model import Frame
 from hyrfpack.scene import Camera, Picture, Scene
-from hyrfpack.train import surface_points
+from hyrfpack.train import surface_depths
 from hyrfpack.train.setup import build_model, initial_points, scene_frame
-from hyrfpack.train.surface_points import MAX_DEPTH_RATIO, MAX_PHOTOS, draw_surface_points, interpolate_inverse_depths
+from hyrfpack.train.surface_depths import MAX_DEPTH_RATIO, MAX_PHOTOS, interpolate_inverse_depths
+from hyrfpack.train.surface_points import draw_surface_points
 
 SMALL_CAMERA = Camera(40, 30, 50.0, 45.0, 19.0, 16.0, np.eye(4))
 
@@ -63,7 +64,7 @@ def test_pixels_of_a_plane_have_its_depths(slopes, distance, seed):
 
     seen, pixels = generator.uniform(size=(2, 200, 2)) * (64, 48)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(surface_points, "MAX_DEPTH_RATIO", 100.0)
+        patch.setattr(surface_depths, "MAX_DEPTH_RATIO", 100.0)
         inverse = interpolate_inverse_depths(camera, points_at(seen, 1 / inverse_at(seen), camera), pixels)
     known = inverse > 0
     assert known.mean() > 0.8
@@ -162,6 +163,17 @@ def test_at_most_a_hundred_photos_are_read_once():
     assert len(points) == 1000 and len(set(read)) == len(read) == MAX_PHOTOS
 
 
+def test_depths_are_found_once_for_runs_of_one_scene(monkeypatch):
+    scene, cache, calls = plane_scene(), PictureCache(), []
+    estimate = surface_depths.estimate_depth_maps
+    monkeypatch.setattr(surface_depths, "estimate_depth_maps", lambda *given: calls.append(1) or estimate(*given))
+    first, again = (draw_surface_points(scene, cache, 300, np.random.default_rng(5))[0] for _ in range(2))
+    fresh, _ = draw_surface_points(scene, PictureCache(), 300, np.random.default_rng(5))
+    assert np.array_equal(first, again) and np.array_equal(first, fresh) and len(calls) == 2
+    fewer = dataclasses.replace(scene, train=scene.train[:3])
+    assert not np.array_equal(draw_surface_points(fewer, cache, 300, np.random.default_rng(5))[0], first)
+
+
 def plane_scene(unit: float = 1.0, *, enlarged: int = 1, cut: int = 0, **layers) -> Scene:
     """Return photos of a wall with a board before it from five places, without tracks; points on the wall alone.
 
@@ -211,7 +223,7 @@ def test_unusable_pixels_of_large_photos_give_no_points(layer):
     layers = {"mask": shown} if layer == "mask" else {"alpha": np.where(shown, 255, 254).astype(np.uint8)}
     scene = plane_scene(enlarged=2, **layers)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(surface_points, "MAX_DEPTH_MAP_SIDE_PIXELS", 64)
+        patch.setattr(surface_depths, "MAX_DEPTH_MAP_SIDE_PIXELS", 64)
         points, _ = draw_surface_points(scene, PictureCache(), 500, np.random.default_rng(0))
     assert len(points) == 500
     columns = [view.camera.project(points)[0] for view in scene.train]
@@ -221,7 +233,7 @@ def test_unusable_pixels_of_large_photos_give_no_points(layer):
 def test_many_points_without_tracks_are_a_guide_as_good_as_few():
     scene = plane_scene()
     many = np.repeat(scene.points, 300, axis=0)
-    assert len(many) > surface_points.MAX_GUIDING_POINTS
+    assert len(many) > surface_depths.MAX_GUIDING_POINTS
     scene = dataclasses.replace(scene, points=many, point_colors=np.full((len(many), 3), 0.5, np.float32))
     points, _ = draw_surface_points(scene, PictureCache(), 300, np.random.default_rng(0))
     z = points[:, 2]
