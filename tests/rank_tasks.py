@@ -93,8 +93,10 @@ def call_collectives(ranks: Ranks) -> dict:
         "broadcast": ranks.broadcast(("by", ranks.rank)),
         "summed": ranks.all_reduce(torch.tensor([1.0, ranks.rank])).tolist(),
         "returned": ranks.run_on_all(lambda: ranks.rank * 10),
+        "returned by the main process": ranks.run_on_main(lambda: ("rank", ranks.rank)),
         "error on the last": error_message(lambda: ranks.run_on_all(refuse(ranks.size - 1))),
         "error on all": error_message(lambda: ranks.run_on_all(refuse(0))),
+        "error on the main process": error_message(lambda: ranks.run_on_main(refuse(0))),
         "averaged": weight.grad.tolist(),
         "averaged of idle": None if idle.grad is None else idle.grad.tolist(),
         "sums": sums.tolist(),
@@ -163,6 +165,12 @@ def train_both_scenes(ranks: Ranks) -> list[dict]:
         record_training(ranks, six_photo_scene(), SIX_PHOTO_CONFIG),
         record_training(ranks, three_photo_scene(), EXPOSURE_CONFIG),
     ]
+
+
+def digest_of_first_model(ranks: Ranks) -> str:
+    """Return the digest of an untrained model, for which each rank would draw other points."""
+    config = dataclasses.replace(SIX_PHOTO_CONFIG, seed=ranks.rank, max_gaussians=2 * len(six_photo_scene().points))
+    return digest(Trainer(six_photo_scene(), config, ranks=ranks).model.parameters())
 
 
 def signal_at_step(number: int, at: int) -> Progress:

@@ -119,7 +119,7 @@ def train_blocks(
         )
     plan = plan_blocks(scene, columns, rows)
     # This check ignores existing results. It runs first, so that no folder is created where nothing may be written.
-    ranks.run_on_all(lambda: check_outputs(out, scene, overwrite=True) if ranks.is_main else None)
+    ranks.run_on_main(lambda: check_outputs(out, scene, overwrite=True))
     with exclusive_folder(out, ranks=ranks):
         resume = ranks.broadcast(resume or (ranks.restarts > 0 and is_begun(out)))
         cache = context.cache or PictureCache(memory_bytes() // 4 // ranks.local_size)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.checks import check_type
@@ -82,7 +81,7 @@ def compress_model(
     source, ranks = find_model(source), context.ranks or SINGLE_PROCESS
     # Only the main process checks the target, while the others wait. They must not mistake its output for an old file.
     outputs = Outputs(source, scene=data, overwrite=overwrite)
-    ranks.run_on_all(lambda: outputs.file(target) if ranks.is_main else None)
+    ranks.run_on_main(lambda: outputs.file(target))
     check_request(config, data)
     compress = _compress_merged if is_merged(source) else _compress_single
     report = compress(source, target, config, data, overwrite, context)
@@ -101,16 +100,11 @@ def _compress_single(
     ranks = context.ranks or SINGLE_PROCESS
     if config.profile != "compact":
         settings = config.encoder_settings()
-        repacked = ranks.run_on_all(
-            lambda: repack(source, target, config.profile, overwrite=overwrite, **settings) if ranks.is_main else None
-        )
-        return CompressionReport(**vars(cast(FileReport, ranks.broadcast(repacked))))
+        repacked = ranks.run_on_main(lambda: repack(source, target, config.profile, overwrite=overwrite, **settings))
+        return CompressionReport(**vars(repacked))
     with context.open_progress("compress") as progress:
         candidate, search_result, sensitivity = _encode_compact(source, config, data, context, progress)
-    written = ranks.run_on_all(
-        lambda: write_model(candidate.data, target, overwrite=overwrite) if ranks.is_main else None
-    )
-    report = cast(FileReport, ranks.broadcast(written))
+    report = ranks.run_on_main(lambda: write_model(candidate.data, target, overwrite=overwrite))
     total = sum(candidate.predicted_errors.values())
     return CompressionReport(
         **vars(report),

@@ -44,8 +44,8 @@ SLURM_PORTS = range(20_000, 40_000)
 class Ranks:
     """A group of processes that work together, and the place of this process in it.
 
-    `all_reduce`, `all_gather`, `broadcast`, `run_on_all` and `raise_if_any` are collective: all processes have to call
-    them in the same order, and each call waits for the slowest process.
+    `all_reduce`, `all_gather`, `broadcast`, `run_on_all`, `run_on_main` and `raise_if_any` are collective: all
+    processes have to call them in the same order, and each call waits for the slowest process.
 
     Attributes:
         rank, size: number of this process, from 0, and number of processes.
@@ -138,6 +138,17 @@ class Ranks:
             problem = error
         self.raise_if_any(problem)
         return cast(Item, result)
+
+    def run_on_main(self, work: Callable[[], Item]) -> Item:
+        """Run a function on rank 0 alone, and return its result on all ranks.
+
+        Args:
+            work: returns an object that can be pickled.
+
+        Raises:
+            HyrfError: the function raised one; all ranks raise it.
+        """
+        return self.broadcast(cast(Item, self.run_on_all(lambda: work() if self.is_main else None)))
 
     def raise_if_any(self, problem: HyrfError | None) -> None:
         """Raise an error on all ranks if any of them has one: that of the lowest such rank.

@@ -119,7 +119,7 @@ def train_model(
     check_target(scene, config)
     ranks = context.ranks or SINGLE_PROCESS
     # This check ignores existing results. It runs first, so that no folder is created where nothing may be written.
-    ranks.run_on_all(lambda: check_outputs(out, scene, overwrite=True) if ranks.is_main else None)
+    ranks.run_on_main(lambda: check_outputs(out, scene, overwrite=True))
     with exclusive_folder(out, ranks=ranks):
         device = context.choose_device()
         with context.open_progress(interruptible=False) as progress:

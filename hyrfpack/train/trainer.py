@@ -122,7 +122,7 @@ class Trainer:
         self.pilots: list[dict] = []  # The scores of the pilot runs, see `PilotScore`.
         self._warmup_steps = FIELD_WARMUP_STEPS if model is None else 0
         if model is None:
-            model, self.budget, self.choices = ranks.run_on_all(lambda: build_model(scene, config, self.cache))
+            model, self.budget, self.choices = ranks.run_on_main(lambda: build_model(scene, config, self.cache))
         else:
             self.budget = config.max_gaussians or len(model)
         self._reserves, self._reserves_memory = ReserveEstimator(), can_reserve(device) and ranks.is_single

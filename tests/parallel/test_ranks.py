@@ -190,7 +190,7 @@ def test_a_single_process_opens_no_network_connection(environment):
         values = torch.tensor([1.0, 2.0])
         assert ranks.all_reduce(values) is values and values.tolist() == [1.0, 2.0]
         assert ranks.all_gather("word") == ["word"] and ranks.broadcast("word") == "word"
-        assert ranks.run_on_all(lambda: 3) == 3
+        assert ranks.run_on_all(lambda: 3) == ranks.run_on_main(lambda: 3) == 3
     assert dict(os.environ) == before
 
 
@@ -242,7 +242,7 @@ def test_collectives_return_the_values_of_all_ranks_in_order(collective_results)
     for rank, results in enumerate(collective_results):
         assert results["gathered"] == [{"rank": 0}, {"rank": 1}, {"rank": 2}]
         assert results["broadcast"] == ("by", 0) and results["summed"] == [3.0, 3.0]
-        assert results["returned"] == 10 * rank
+        assert results["returned"] == 10 * rank and results["returned by the main process"] == ("rank", 0)
 
 
 @needs_ranks
@@ -257,6 +257,13 @@ def test_an_error_on_all_ranks_is_raised_as_on_one_process(collective_results):
     assert [results["error on all"] for results in collective_results] == [
         f"photo {rank} is bad; replace it" for rank in range(3)
     ]
+
+
+@needs_ranks
+def test_an_error_of_the_main_process_is_raised_on_all_ranks(collective_results):
+    assert {results["error on the main process"] for results in collective_results} == {
+        "process 0 of 3: photo 0 is bad; replace it"
+    }
 
 
 @needs_ranks

@@ -189,6 +189,13 @@ def test_both_ranks_have_identical_parameters_after_every_step(two_ranks_and_one
 
 
 @needs_ranks
+def test_all_ranks_start_from_the_model_of_the_main_process():
+    """Depths that differ by rounding, as on processors of two kinds, would give other points and colours."""
+    first, second = (outcome.result for outcome in run_on_ranks(tasks.digest_of_first_model))
+    assert first == second == tasks.digest_of_first_model(SINGLE_PROCESS)
+
+
+@needs_ranks
 def test_both_ranks_record_the_same_curve_except_for_times(two_ranks_and_one):
     (first, second), _, _ = two_ranks_and_one
     curves = [[{**record, "seconds": 0} for record in rank["records"]] for rank in (first, second)]
