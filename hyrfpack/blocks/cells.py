@@ -10,7 +10,8 @@ from hyrfpack.cameras.paths import estimate_up
 from hyrfpack.scene import Scene
 
 OVERLAP_RATIO = 0.1  # An extended cell reaches this share of the mean side of a cell beyond each of its borders.
-INNER_PERCENTILE = 90  # Of the points and cameras, so many per cent decide which side of the scene is the longer one.
+# The longer side of the ground is found from this percentage of points and cameras, those nearest to the median.
+INNER_PERCENTILE = 90
 EXTENT_PERCENTILES = (1, 99)  # Coordinates outside these do not count for the size of the ground.
 
 

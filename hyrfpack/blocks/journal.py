@@ -19,6 +19,7 @@ from hyrfpack.format.run_folder import BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE, MET
 from hyrfpack.train.checkpoint import names_and_sizes
 from hyrfpack.train.results import RECORD_FILE
 from hyrfpack.train.run import is_begun as is_run_begun
+from hyrfpack.train.run import remove_run_files
 
 JOURNAL_VERSION = 1
 
@@ -52,11 +53,10 @@ class Journal:
 
     def start(self) -> None:
         """Write the journal of a new run, and remove what would be taken for results of its blocks, or resumed."""
-        for name in (CHECKPOINT_FILE, RECORD_FILE):  # of a run without blocks, which this one replaces
-            (self.path.parent.parent / name).unlink(missing_ok=True)
-        for block in self.photos:
-            for name in (CHECKPOINT_FILE, RECORD_FILE, METRICS_FILE, MODEL_FILE):
-                (self.folder(block) / name).unlink(missing_ok=True)
+        replaced = self.path.parent.parent  # may hold a run without blocks
+        remove_run_files(replaced / name for name in (CHECKPOINT_FILE, RECORD_FILE))
+        names = (CHECKPOINT_FILE, RECORD_FILE, METRICS_FILE, MODEL_FILE)
+        remove_run_files(self.folder(block) / name for block in self.photos for name in names)
         content = {"version": JOURNAL_VERSION, "settings": self.settings, "photos": self.photos}
         write_atomic(self.path, json.dumps(content, indent=1).encode())
 

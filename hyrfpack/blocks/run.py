@@ -34,6 +34,7 @@ from hyrfpack.format.run_folder import BLOCKS_FOLDER, CHECKPOINT_FILE, METRICS_F
 from hyrfpack.format.sections import MAX_PARTS
 from hyrfpack.lock import exclusive_folder, try_lock
 from hyrfpack.model.merged import parts_of
+from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Progress, TaskEvent, items_of_progress
 from hyrfpack.scene import Scene
@@ -43,16 +44,22 @@ from hyrfpack.train.decisions import measures_budget, measures_exposure
 from hyrfpack.train.finish import TrainResult
 from hyrfpack.train.results import VIEWS_FOLDER, scene_facts
 from hyrfpack.train.run import Observer, resuming, train_model
-from hyrfpack.train.setup import budget_for
+from hyrfpack.train.setup import budget_for, check_target
 
 _LOG = logging.getLogger(__name__)
 
-# `auto` gives each block at most so many photos and bytes.
-MAX_BLOCK_PHOTOS = 500
-# Of the budget, at the peak of training: 1,260 for each Gaussian, of which there are up to twice as many.
-BYTES_PER_GAUSSIAN = 2_500
+# "auto" makes at least one block for so many photos. Blocks share photos, so one may have more.
+PHOTOS_PER_BLOCK = 500
+# Peak memory of training: 1,260 bytes for each Gaussian, of which there are up to two for each one of the budget.
+BYTES_PER_BUDGETED_GAUSSIAN = 2_500
+# Gaussians take at most this ratio of the device's memory; photos and the pixels of one view take the rest.
+MAX_MEMORY_RATIO = 0.5
 POLL_SECONDS = 1.0  # A process without a block looks for one this often.
-MAX_MEMORY_SHARE = 0.5  # of the device; photos and one view's pixels take the rest
+
+
+def block_log(log: Path, block: Block) -> Path:
+    """Return the path of a block's log, which has the block's name in its own."""
+    return log.with_stem(f"{log.stem}-{block.name}")
 
 
 def train_blocks(
@@ -78,8 +85,9 @@ def train_blocks(
         scene: the scene, from `hyrfpack.load_scene`.
         out: the run's folder, created if missing.
         config: settings of the run; None for the defaults. `steps` are those of each block. `max_gaussians` and
-            `target_bytes` are those of all blocks together. The pilot runs of the block with the most photos decide
-            `exposure` and `budget_factor` for all.
+            `target_bytes` are divided among the blocks by their points, some of which several blocks count, so the
+            merged file may hold somewhat more. The pilot runs of the block with the most photos decide `exposure` and
+            `budget_factor` for all.
         blocks: columns x rows of the grid, such as "2x2"; columns follow each other along the longer side of the
             scene. "auto" takes as many as memory and photos ask for. A single block is a run of `train_model`.
         resume: resume an interrupted run; blocks that are finished are kept.
@@ -109,6 +117,7 @@ def train_blocks(
     device = context.choose_device()
     if config.preset == "auto":
         config = dataclasses.replace(config, preset=detect_preset(scene)[0])
+    check_target(scene, config)
     ranks = context.ranks or SINGLE_PROCESS
     # Machines may differ in their memory, but all processes need the same grid.
     is_auto = blocks == "auto"
@@ -128,6 +137,10 @@ def train_blocks(
             journal = open_journal(out, f"{columns}x{rows}", plan, config, resume=resume, overwrite=overwrite)
             if ranks.is_main:
                 check_outputs(out, scene, overwrite=resume or overwrite)
+                if log is not None:
+                    logs = Outputs(scene=scene, overwrite=resume or overwrite)
+                    for block in plan.blocks:
+                        logs.file(block_log(Path(log), block))
                 with context.open_progress("blocks", interruptible=False) as progress:
                     check_photos(scene, cache, progress)
             return journal
@@ -160,7 +173,9 @@ def choose_grid(scene: Scene, config: TrainConfig, device: torch.device, ranks: 
     else:
         memory = memory_bytes() // ranks.local_size
     budget, _ = budget_for(scene, config)
-    needed = max(budget * BYTES_PER_GAUSSIAN / (MAX_MEMORY_SHARE * memory), len(scene.train) / MAX_BLOCK_PHOTOS)
+    needed = max(
+        budget * BYTES_PER_BUDGETED_GAUSSIAN / (MAX_MEMORY_RATIO * memory), len(scene.train) / PHOTOS_PER_BLOCK
+    )
     most = max(1, min(MAX_PARTS, len(scene.train) // MIN_BLOCK_PHOTOS))
     count = max(1, min(math.ceil(needed), most))
     along, across = ground_extent(scene, ground_axes(scene)).tolist()
@@ -231,7 +246,7 @@ class _BlockRun:
                 resume=resumes,
                 overwrite=not resumes,
                 observer=self.observer if self.ranks.is_main else None,
-                log=None if self.log is None else self.log.with_stem(f"{self.log.stem}-{block.name}"),
+                log=None if self.log is None else block_log(self.log, block),
                 context=dataclasses.replace(
                     self.context, ranks=None, progress=None if is_silent else self.context.progress
                 ),
@@ -240,7 +255,9 @@ class _BlockRun:
                 raise HyrfError(result.missing, fix="free space on the disk")
         except HyrfError as error:
             kept = f"finished blocks are kept, {resuming(self.overwrite)} continues"
-            raise error.with_text(f"{label}: {error.problem}", f"{error.fix}; {kept}") from error
+            # The cause says the same, without how to resume a run that has no blocks.
+            plain = error.__cause__ if isinstance(error.__cause__, HyrfError) else error
+            raise plain.with_text(f"{label}: {plain.problem}", f"{plain.fix}; {kept}") from error
         return result
 
     def _block_config(self, block: Block) -> TrainConfig | None:

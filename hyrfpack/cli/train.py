@@ -129,8 +129,12 @@ def train(
 
     if blocks not in (None, "auto"):
         parse_grid(blocks)  # before photos are read, which takes minutes for large scenes
-    is_resumable = is_begun if blocks is None else is_block_run_begun
     torch_device = choose_command_device(device, ranks)
+
+    def is_resumable(run: Path) -> bool:
+        # "auto" may choose a single block, which is trained as a run without blocks.
+        return is_begun(run) or is_block_run_begun(run)
+
     try:
         scene = ranks.run_on_all(lambda: read_scene(data, reader_options))
     except HyrfNoPosesError:
@@ -185,10 +189,10 @@ def train(
 
 def _estimate_poses(photos: Path, run: Path, images: str | None, resume: bool, overwrite: bool) -> Path:
     """Estimate the poses of photos and return the folder of the scene, which lies in the folder of the run."""
-    from hyrfpack.make.auto_pose import SCENE_FOLDER, auto_pose
+    from hyrfpack.make.auto_pose import auto_pose
 
     try:
         return auto_pose(photos, run, images=images, resume=resume, overwrite=overwrite)
     except KeyboardInterrupt:
-        note(f"stopped in poses; the same command resumes with {run / SCENE_FOLDER}")
+        note("stopped while estimating poses; the same command resumes")
         click.get_current_context().exit(1)

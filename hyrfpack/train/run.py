@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -139,6 +139,23 @@ def train_model(
             ).execute()
 
 
+def remove_run_files(paths: Iterable[Path]) -> None:
+    """Remove files of an earlier run, as far as they exist.
+
+    Raises:
+        HyrfError: a file cannot be removed.
+    """
+    for path in paths:
+        try:
+            with suppress(FileNotFoundError, NotADirectoryError):
+                path.unlink()
+        except OSError as error:
+            raise HyrfError(
+                f"{path}: this file of an earlier run cannot be removed ({error.strerror or error})",
+                fix="remove it yourself, or choose another folder",
+            ) from error
+
+
 @dataclass(frozen=True)
 class _Run:
     """One call of `train_model`, in a folder that it has locked."""
@@ -190,16 +207,7 @@ class _Run:
         """Remove files of the run that this one replaces, which would be resumed if this one stopped early."""
         if not self.overwrite or self.resume or not self.ranks.is_main:
             return
-        for name in (RECORD_FILE, BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE):
-            path = self.out / name
-            try:
-                with suppress(FileNotFoundError, NotADirectoryError):
-                    path.unlink()
-            except OSError as error:
-                raise HyrfError(
-                    f"{path}: this file of an earlier run cannot be removed ({error.strerror or error})",
-                    fix="remove it yourself, or choose another folder",
-                ) from error
+        remove_run_files(self.out / name for name in (RECORD_FILE, BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE))
 
     def _complete(self, record: TrainingRecord) -> TrainResult:
         """Compute and write the missing results of a finished model; only rank 0 does so."""

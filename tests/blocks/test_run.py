@@ -17,7 +17,7 @@ from scenes import QUIET_CONTEXT
 from hyrfpack.blocks import train_blocks
 from hyrfpack.blocks.journal import Journal, is_begun
 from hyrfpack.blocks.plan import MIN_BLOCK_PHOTOS, plan_blocks
-from hyrfpack.blocks.run import BYTES_PER_GAUSSIAN, choose_grid
+from hyrfpack.blocks.run import BYTES_PER_BUDGETED_GAUSSIAN, choose_grid
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import load_merged_model, load_model
@@ -62,6 +62,29 @@ def test_a_new_run_in_blocks_removes_the_checkpoint_of_a_run_without_blocks(tmp_
         (tmp_path / name).write_bytes(b"of an earlier run")
     Journal(tmp_path / "blocks" / "blocks.json", {}, {}).start()
     assert is_begun(tmp_path) and [path.name for path in tmp_path.iterdir()] == ["blocks"]
+
+
+def test_a_file_of_an_earlier_run_that_cannot_be_removed_is_a_clear_error(tmp_path):
+    (tmp_path / CHECKPOINT_FILE).mkdir()
+    with pytest.raises(HyrfError, match=f"{CHECKPOINT_FILE}: this file of an earlier run cannot be removed"):
+        Journal(tmp_path / "blocks" / "blocks.json", {}, {}).start()
+
+
+def test_logs_of_blocks_do_not_replace_other_files(tmp_path):
+    (tmp_path / "log-2-1.jsonl").write_bytes(b"of somebody else")
+    with pytest.raises(HyrfError, match=r"log-2-1\.jsonl.*overwrite=True"):
+        train_blocks(
+            block_scene(), tmp_path / "run", BLOCK_CONFIG, "2x1", log=tmp_path / "log.jsonl", context=QUIET_CONTEXT
+        )
+    assert (tmp_path / "log-2-1.jsonl").read_bytes() == b"of somebody else"
+    assert not (tmp_path / "run" / "blocks").exists()
+
+
+def test_a_target_size_that_no_file_can_have_is_refused_before_training(tmp_path):
+    config = dataclasses.replace(BLOCK_CONFIG, max_gaussians=None, target_bytes=100)
+    with pytest.raises(HyrfError, match="below the smallest possible file"):
+        train_blocks(block_scene(), tmp_path / "run", config, "2x1", context=QUIET_CONTEXT)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_without_blocks_replaces_one_in_blocks_only_if_asked_and_then_removes_its_journal(finished, tmp_path):
@@ -197,7 +220,7 @@ def test_auto_takes_as_many_blocks_as_the_memory_of_each_process_asks_for(monkey
 @pytest.mark.parametrize("needed", [1, 2, 3, 5, 7, 64])
 def test_auto_has_neither_too_few_blocks_nor_blocks_with_too_few_photos(monkeypatch, photos, needed):
     monkeypatch.setattr("hyrfpack.blocks.run.memory_bytes", lambda: 2**30)
-    budget = int(needed * 2**29 / BYTES_PER_GAUSSIAN)
+    budget = int(needed * 2**29 / BYTES_PER_BUDGETED_GAUSSIAN)
     scene = dataclasses.replace(block_scene(), train=(40 * block_scene().train)[:photos])
     config = dataclasses.replace(BLOCK_CONFIG, max_gaussians=budget)
     columns, rows = choose_grid(scene, config, torch.device("cpu"), SINGLE_PROCESS)

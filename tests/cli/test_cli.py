@@ -245,8 +245,9 @@ def test_a_video_without_ffmpeg_gives_pictures_and_a_note(packed, tmp_path, monk
     [
         ((), "the same command with --resume continues"),
         (("--overwrite",), "with --resume instead of --overwrite continues"),
+        (("--blocks", "auto"), "the same command with --resume continues"),
     ],
-    ids=["new", "overwriting"],
+    ids=["new", "overwriting", "a single block"],
 )
 def test_interrupted_training_saves_exits_with_1_and_says_how_to_resume(options, messages, data, tmp_path, monkeypatch):
     before, run = signal.getsignal(signal.SIGINT), Trainer.run
