@@ -130,11 +130,17 @@ def log_as_notes() -> Iterator[None]:
 
 
 @contextmanager
-def notes_only_of(*packages: str) -> Iterator[None]:
-    """Print no messages of other packages in the block, because these show their work as progress or not at all."""
+def notes_only_of(*packages: str, silent: tuple[str, ...] = ()) -> Iterator[None]:
+    """Print only warnings of other packages in the block, because these show their work as progress or not at all.
+
+    Args:
+        packages: their messages are printed.
+        silent: packages of which not even warnings are printed, because they name options that the command lacks.
+    """
 
     def is_shown(record: logging.LogRecord) -> bool:
-        return record.name.startswith(packages)
+        is_warning = record.levelno >= logging.WARNING and not record.name.startswith(silent)
+        return is_warning or record.name.startswith(packages)
 
     _NOTE_HANDLER.addFilter(is_shown)
     try:

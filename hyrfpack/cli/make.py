@@ -86,7 +86,7 @@ def make(
     torch_device = choose_command_device(device)
     try:
         with (
-            notes_only_of("hyrfpack.make", "hyrfpack.poses", "hyrfpack.live"),
+            notes_only_of("hyrfpack.make", "hyrfpack.poses", "hyrfpack.live", silent=("hyrfpack.imports",)),
             serve_training_view(output.name, view, view_port) as observer,
         ):
             result = run(

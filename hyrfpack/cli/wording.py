@@ -11,6 +11,7 @@ _WORD_QUOTE = "'"  # Python writes it around a value that is a word
 _OPTION_OF_ARGUMENT = {
     "degree": "--sh-degree",
     "finetune_steps": "--finetune",
+    "observer": "--view",
     "target_bytes": "--target-size",
     "tiles_3d": "--3d-tiles",
 }

@@ -122,7 +122,7 @@ def _train_coarse_model(
 
 
 def _prefix_events(progress: Progress) -> Progress:
-    """Report tasks as parts of the first look, without the shares of them, which are not shares of the whole work."""
+    """Return a progress function that names tasks as parts of the first look and drops their shares."""
 
     def report(event: Event) -> None:
         if isinstance(event, TaskEvent):

@@ -21,6 +21,7 @@ from hyrfpack.make.plan import (
     QUALITIES,
     Plan,
     count_packing_passes,
+    estimate_scene_seconds,
     mean_megapixels,
 )
 from hyrfpack.make.progress import Reporter
@@ -151,7 +152,9 @@ def fit_plan_to_minutes(
     if (remaining := end - monotonic()) <= 0:
         _LOG.warning(f"no time is left for training: making a draft of {draft.steps} steps")
         draft_max_size = min(reading.max_size or draft.max_size, draft.max_size)
-        return dataclasses.replace(requested, steps=draft.steps, max_size=draft_max_size)
+        plan = dataclasses.replace(requested, steps=draft.steps, max_size=draft_max_size)
+        reporter.estimates |= estimate_scene_seconds(reading.load(path, draft_max_size), plan, device)
+        return plan
     sizes = _candidate_sizes(scene, reading.max_size)
     probed = next((size for size in reversed(sizes) if size >= MIN_PROBE_PHOTO_SIZE), sizes[0])
     scenes = {reading.max_size: scene}

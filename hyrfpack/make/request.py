@@ -24,6 +24,9 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.train import Trainer
 from hyrfpack.train.setup import check_target
 
+_PHOTO_SETTINGS = (
+    "minutes", "target_bytes", "max_gaussians", "preset", "matching", "images", "max_size", "test_every"
+)  # fmt: skip
 _SCENE_STAGES = ("training", "compression", "scoring", "export")
 _STAGES_OF_SOURCE = {"model": _SCENE_STAGES[-1:], "splats": ("import", "export"), "scene": _SCENE_STAGES}
 
@@ -78,7 +81,7 @@ class Request:
         """Check an existing output. Raises HyrfError: it was made by an earlier call and may not be replaced."""
         if not self.overwrite and os.path.lexists(self.output) and self.is_output_unchanged(state):
             raise HyrfError(
-                f"{self.output}: this was made of other photos or with other settings",
+                f"{self.output}: an earlier call made this from another source or with other settings",
                 fix="name another, or replace it with `overwrite=True`",
             )
 
@@ -100,20 +103,13 @@ class Request:
                 f"{source.path}: this is a .hyrf file already", fix="make it smaller with 'hyrfpack compress'"
             )
         if source.kind in ("model", "splats"):
-            options = {
-                "minutes": self.config.minutes,
-                "a target size": self.config.target_bytes,
-                "a number of Gaussians": self.config.max_gaussians,
-                "a preset": None if self.config.preset == "auto" else self.config.preset,
-                "a matching method": None if self.config.matching == "auto" else self.config.matching,
-                "a folder of photos": self.config.images,
-                "a size of photos": self.config.max_size,
-                "a split of photos": self.config.test_every,
-                "a view of the training": self.observer,
-            }
-            for name, value in options.items():
-                if value is not None:
-                    raise HyrfError(f"{source.path}: {name} can be asked for with photos only", fix="leave it out")
+            given = [name for name in _PHOTO_SETTINGS if getattr(self.config, name) != getattr(MakeConfig, name)]
+            given += ["observer"] if self.observer is not None else []
+            if given:
+                raise HyrfError(
+                    f"{source.path}: this is no set of photos, and a setting was given that applies to photos only",
+                    fix=f"leave out `{given[0]}`",
+                )
         if source.kind == "model":
             for name in ("quality", "seed"):
                 if getattr(self.config, name) != getattr(MakeConfig, name):

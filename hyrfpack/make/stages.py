@@ -21,7 +21,7 @@ from hyrfpack.context import RunContext
 from hyrfpack.copying import copy_file
 from hyrfpack.counts import format_count
 from hyrfpack.device import describe_device
-from hyrfpack.errors import HyrfError, HyrfSizeError
+from hyrfpack.errors import HyrfError, HyrfSizeError, HyrfTrainingError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.export import export_model
 from hyrfpack.format import describe_file, load_model
@@ -29,7 +29,7 @@ from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.imports import ImportConfig, import_splats
 from hyrfpack.make.first_look import show_first_look
 from hyrfpack.make.plan import Plan
-from hyrfpack.make.preview import write_preview
+from hyrfpack.make.preview import remove_preview, write_preview
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.stage_cache import PRODUCT_NAMES, StageCache, Stopped
 from hyrfpack.make.state import file_digest, files_digest
@@ -37,7 +37,7 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Event, StepEvent, TaskEvent
 from hyrfpack.progress.status import StepMeans, format_psnr
 from hyrfpack.scene import Scene
-from hyrfpack.splats.names import SOG_META_NAME
+from hyrfpack.splats.names import sog_folder
 from hyrfpack.train import Trainer, train_model
 from hyrfpack.train.decisions import measures_length
 from hyrfpack.train.run import is_begun
@@ -83,9 +83,9 @@ def run_pose_stage(
                 show_first_look(photos, stage_cache.folder / FIRST_LOOK_FOLDER, config, observer, context)
             estimate_poses(photos, scene, config, context=context)
         shutil.rmtree(scene / ".poses", ignore_errors=True)  # products in progress stay if a call is killed at its end
-        files = sorted(path for path in scene.rglob("*") if path.is_file())
+        written = sorted(path for path in scene.rglob("*") if path.is_file())
         report = json.loads((scene / POSES_REPORT_NAME).read_bytes())
-        return report, [path.relative_to(stage_cache.folder).as_posix() for path in files]
+        return report, [path.relative_to(stage_cache.folder).as_posix() for path in written]
 
     inputs = {"photos": files_digest(files, photos), **asdict(config)}
     return stage_cache.run_stage("poses", inputs, execute)
@@ -117,8 +117,8 @@ def run_training_stage(
     if config.target_bytes != plan.target_bytes:
         before = "without a target size" if config.target_bytes is None else f"for {config.target_bytes:,} bytes"
         _LOG.info(
-            f"the model is trained {before}, and only compressed for the requested size; another work folder "
-            "(`work`) trains it anew"
+            f"the trained model is kept: it was trained {before}, and only the compression is repeated; name another "
+            "work folder (`work`) to train it again"
         )
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
@@ -130,12 +130,15 @@ def run_training_stage(
                 f"on {describe_device(context.choose_device())}"
             )
             resume = resuming and is_begun(run)
+            if not resume:
+                remove_preview(stage_cache)  # of photos or settings that have changed
             progress = _TrainingProgress(stage_cache.reporter).report_event
             trainers: list[Trainer] = []
 
             def observe(trainer: Trainer) -> None:
                 # A finished trainer is not kept, so that its memory is free while results are written.
-                trainers[:] = [trainer] if trainer.step < trainer.steps else []
+                is_main_run = trainer.kind != "pilot run"  # Pilots are short, and without the validation photos.
+                trainers[:] = [trainer] if is_main_run and trainer.step < trainer.steps else []
                 if observer is not None:
                     observer(trainer)
 
@@ -145,7 +148,10 @@ def run_training_stage(
                     context=replace(context, progress=progress),
                 )  # fmt: skip
             except HyrfError as error:  # the fix of this error refers to the command `train`
-                raise error.__cause__ if isinstance(error.__cause__, HyrfError) else error from None
+                plain = error.__cause__ if isinstance(error.__cause__, HyrfError) else error
+                if resume and not trainers and isinstance(plain, HyrfTrainingError):  # the checkpoint cannot be used
+                    plain = plain.with_text(fix=f"delete {run} and run the same command again")
+                raise plain from None
             if not trained.complete:
                 raise Stopped("training", write_preview(stage_cache, trainers[-1], context) if trainers else None)
             if not (run / METRICS_FILE).is_file():  # the disk was full; the next call writes them
@@ -241,9 +247,8 @@ def run_import_stage(
     stage_cache: StageCache, source: Path, psnr: float, seed: int, context: RunContext
 ) -> dict[str, Any]:
     """Import splats of another program as `model.hyrf`; return the report of `hyrfpack.import_splats`."""
-    files = sorted(p for p in source.parent.iterdir() if p.is_file()) if source.name == SOG_META_NAME else [source]
-    if source.is_dir():
-        files = sorted(p for p in source.iterdir() if p.is_file())
+    folder = sog_folder(source)
+    files = [source] if folder is None else sorted(path for path in folder.iterdir() if path.is_file())
     config = ImportConfig(psnr=psnr, seed=seed)
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
@@ -253,6 +258,8 @@ def run_import_stage(
             config,
             context=context,
         )
+        if round(report.psnr, 1) < round(psnr, 1):
+            _LOG.warning(f"the target PSNR of the import is {psnr:g} dB, but the file reaches {report.psnr:.1f} dB")
         return report.to_dict(), [PACKED_MODEL]
 
     inputs = {"splats": files_digest(files, source.parent), "settings": asdict(config)}

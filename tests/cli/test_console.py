@@ -150,8 +150,10 @@ def describe_with_messages(monkeypatch) -> None:
 
     def describe(path):
         logging.getLogger("hyrfpack.made_up").warning("100 % of it is lost; use `max_size=0`")
-        with notes_only_of("hyrfpack.train", "hyrfpack.make"):
-            logging.getLogger("hyrfpack.export.pipeline").warning("a detail of a stage")
+        with notes_only_of("hyrfpack.train", "hyrfpack.make", silent=("hyrfpack.imports",)):
+            logging.getLogger("hyrfpack.export.pipeline").info("a detail of a stage")
+            logging.getLogger("hyrfpack.imports.run").warning("use `psnr`, which this command lacks")
+            logging.getLogger("hyrfpack.export.pipeline").warning("a warning of a stage")
             logging.getLogger("hyrfpack.make.run").info("a sentence of the command")
         logging.getLogger("hyrfpack.made_up").debug("a detail for developers")
         return describe_file(path)
@@ -161,7 +163,7 @@ def describe_with_messages(monkeypatch) -> None:
 
 @pytest.mark.usefixtures("describe_with_messages")
 def test_messages_of_the_library_are_notes_that_name_options(model):
-    printed = ["100 % of it is lost; use --max-size 0", "a sentence of the command"]
+    printed = ["100 % of it is lost; use --max-size 0", "a warning of a stage", "a sentence of the command"]
     assert succeeded("info", model).stderr.splitlines() == printed
     json.loads(succeeded("info", model, "--json").stdout)
     assert succeeded("info", model, "--json").stderr.splitlines() == printed

@@ -10,17 +10,19 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from hyrfpack.atomic import TEMPORARY_PREFIX
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.context import RunContext
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.make import Stopped, make_scene, stages
 from hyrfpack.make.preview import PREVIEW_FILE
 from hyrfpack.make.stage_cache import interruptible
 from hyrfpack.progress import StageEvent, StepEvent
+from hyrfpack.train import TrainResult
 
 pytestmark = pytest.mark.usefixtures("fake_stages")
 
@@ -211,24 +213,66 @@ def test_a_kill_at_any_report_loses_no_finished_work(uninterrupted_products, pos
     assert {event.stage for event, _ in killed} == set(STAGE_FUNCTIONS)
 
 
-def test_the_preview_of_an_interrupted_training_is_removed_when_the_training_is_finished(posed, tmp_path, monkeypatch):
-    def stop(event: StageEvent) -> None:
-        if event.details[:1] == ("step 5/9",):
-            raise KeyboardInterrupt
+def stop_at_step_5(event: StageEvent) -> None:
+    if event.details[:1] == ("step 5/9",):
+        raise KeyboardInterrupt
 
+
+def test_the_preview_of_an_interrupted_training_is_removed_when_the_training_is_finished(posed, tmp_path, monkeypatch):
     with pytest.raises(Stopped):
-        make_scene(posed, tmp_path / "scene.html", context=RunContext(progress=stop))
+        make_scene(posed, tmp_path / "scene.html", context=RunContext(progress=stop_at_step_5))
     (tmp_path / "scene.work" / PREVIEW_FILE).write_bytes(b"the scene at step 5")
     assert not (make_scene(posed, tmp_path / "scene.html").work / PREVIEW_FILE).exists()
 
 
-def test_an_interrupted_training_is_not_resumed_with_other_settings(posed, tmp_path):
-    def stop(event: StageEvent) -> None:
-        if event.details[:1] == ("step 5/9",):
-            raise KeyboardInterrupt
-
+def test_a_preview_of_earlier_settings_is_removed_even_if_the_new_training_fails(posed, tmp_path, monkeypatch):
     with pytest.raises(Stopped):
-        make_scene(posed, tmp_path / "scene.html", context=RunContext(progress=stop))
+        make_scene(posed, tmp_path / "scene.html", context=RunContext(progress=stop_at_step_5))
+    preview = tmp_path / "scene.work" / PREVIEW_FILE
+    preview.write_bytes(b"the scene at step 5")
+
+    def fail(*arguments, **options):
+        raise HyrfError("a photo cannot be read", fix="replace it")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stages, "train_model", fail)
+        with pytest.raises(HyrfError, match="training failed: a photo cannot be read"):
+            make_scene(posed, tmp_path / "scene.html", MakeConfig(seed=1))
+    assert not preview.exists()
+    assert make_scene(posed, tmp_path / "scene.html", MakeConfig(seed=1)).output.exists()
+
+
+def test_interrupted_pilot_runs_leave_no_preview(posed, tmp_path, monkeypatch):
+    def stop_in_pilots(scene, run, config, *, observer, **options) -> TrainResult:
+        observer(SimpleNamespace(kind="pilot run", step=3, steps=120))
+        return TrainResult(False, 0, None, {})
+
+    monkeypatch.setattr(stages, "train_model", stop_in_pilots)
+    monkeypatch.setattr(stages, "write_preview", lambda *arguments: pytest.fail("a pilot run was packed"))
+    with pytest.raises(Stopped, match="training") as stopped:
+        make_scene(posed, tmp_path / "scene.html")
+    assert stopped.value.preview is None
+
+
+def test_a_checkpoint_that_cannot_be_used_comes_with_advice_that_works(posed, tmp_path, monkeypatch):
+    with pytest.raises(Stopped):
+        make_scene(posed, tmp_path / "scene.html", context=RunContext(progress=stop_at_step_5))
+
+    def refuse(*arguments, **options):
+        raise HyrfTrainingError("the checkpoint is of another version", fix="train anew with `overwrite=True`")
+
+    run = tmp_path / "scene.work" / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(stages, "train_model", refuse)
+        with pytest.raises(HyrfError, match=f"another version; delete {re.escape(str(run))} and run the same command"):
+            make_scene(posed, tmp_path / "scene.html")
+    shutil.rmtree(run)
+    assert make_scene(posed, tmp_path / "scene.html").output.exists()
+
+
+def test_an_interrupted_training_is_not_resumed_with_other_settings(posed, tmp_path):
+    with pytest.raises(Stopped):
+        make_scene(posed, tmp_path / "scene.html", context=RunContext(progress=stop_at_step_5))
     words: list[str] = []
     make_scene(posed, tmp_path / "scene.html", MakeConfig(seed=1), context=record_details(words))
     assert "step 1/9" in words

@@ -274,7 +274,7 @@ def test_a_repeated_call_keeps_everything_and_a_changed_output_needs_overwrite(f
     make_scene(posed, output, work=finished_work)
     before = output.read_bytes()
     assert len(make_scene(posed, output, work=finished_work).kept) == 4
-    with pytest.raises(HyrfError, match="other photos or with other settings.*`overwrite=True`"):
+    with pytest.raises(HyrfError, match="another source or with other settings.*`overwrite=True`"):
         make_scene(posed, output, MakeConfig(target_bytes=1_000_000), work=finished_work)
     assert output.read_bytes() == before
     make_scene(posed, output, MakeConfig(seed=3), work=finished_work, overwrite=True)
@@ -328,14 +328,14 @@ def test_impossible_requests_are_rejected_before_any_work(posed, photos, finishe
         ("none is left to train on; hold out fewer with --test-every", photos, "-o", out, "--test-every", 1),
         ("but clip.mp4; name the video", tmp_path / "videos", "-o", out),
         ("is a .hyrf file already", finished_work / "model.hyrf", "-o", tmp_path / "a.hyrf"),
-        ("with photos only", finished_work / "model.hyrf", "-o", out, "--minutes", 3),
-        ("with photos only", finished_work / "model.hyrf", "-o", out, "--max-gaussians", 30),
-        ("with photos only", finished_work / "model.hyrf", "-o", out, "--preset", "large"),
-        ("with photos only", finished_work / "model.hyrf", "-o", out, "--matching", "exhaustive"),
-        ("with photos only", finished_work / "model.hyrf", "-o", out, "--images", "images_4"),
-        ("with photos only", finished_work / "model.hyrf", "-o", out, "--max-size", 0),
-        ("with photos only", finished_work / "model.hyrf", "-o", out, "--test-every", 0),
-        ("with photos only", finished_work / "model.hyrf", "-o", out, "--view"),
+        ("photos only; leave out --minutes", finished_work / "model.hyrf", "-o", out, "--minutes", 3),
+        ("photos only; leave out --max-gaussians", finished_work / "model.hyrf", "-o", out, "--max-gaussians", 30),
+        ("photos only; leave out --preset", finished_work / "model.hyrf", "-o", out, "--preset", "large"),
+        ("photos only; leave out --matching", finished_work / "model.hyrf", "-o", out, "--matching", "exhaustive"),
+        ("photos only; leave out --images", finished_work / "model.hyrf", "-o", out, "--images", "images_4"),
+        ("photos only; leave out --max-size", finished_work / "model.hyrf", "-o", out, "--max-size", 0),
+        ("photos only; leave out --test-every", finished_work / "model.hyrf", "-o", out, "--test-every", 0),
+        ("photos only; leave out --view", finished_work / "model.hyrf", "-o", out, "--view"),
         ("exported as it is; leave out --quality", finished_work / "model.hyrf", "-o", out, "--quality", "best"),
         ("exported as it is; leave out --seed", finished_work / "model.hyrf", "-o", out, "--seed", 3),
         ("give one of them", posed, "-o", out, "--minutes", 3, "--quality", "draft"),
