@@ -89,7 +89,7 @@ def scene_options(command: Command) -> Command:
 
 
 def is_given(context: click.Context, parameter: click.Parameter) -> bool:
-    """Return whether the user gave a parameter on the command line, be it its default."""
+    """Return whether the user gave a parameter on the command line, even with its default value."""
     return context.get_parameter_source(str(parameter.name)) is ParameterSource.COMMANDLINE
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +27,7 @@ from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import INPUT_PATH, OUTPUT, OUTPUT_FOLDER, reject_non_finite
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.counts import format_count
+from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -225,7 +225,8 @@ def _print_compression(report: CompressionReport, scores: dict[str, float]) -> N
     if report.found:
         click.echo(report.found)
     if report.error is not None:
-        click.echo(f"loss in pictures: {report.error:.2g} mean squared error, {-10 * math.log10(report.error):.1f} dB")
+        psnr = psnr_from_mse(report.error)
+        click.echo(f"loss in pictures: {report.error:.2g} mean squared error, PSNR {psnr:.1f} dB")
     if scores:
         click.echo(
             f"held-out photos: PSNR {scores['psnr_before']:.3f} to {scores['psnr']:.3f} dB, "

@@ -140,8 +140,8 @@ _ACTION_BY_OPTION: dict[str, Callable[[Any], Action]] = {
     type=float,
     multiple=True,
     metavar="SHARE",
-    help="Remove Gaussians in the air whose light the photos contradict, so that they would keep less than SHARE (0 to "
-    f"1) of their opacity; needs --data. Begin with {DEFAULT_MIN_OPACITY_SHARE}; more removes more.",
+    help="Remove floaters, which are Gaussians in front of the surfaces, if the photos support less than SHARE (0 to "
+    f"1) of their opacity; needs --data. Begin with {DEFAULT_MIN_OPACITY_SHARE}; a higher SHARE removes more.",
 )
 @click.option(
     "--gaussians",
@@ -302,7 +302,8 @@ def _print_report(report: EditReport) -> None:
         [step.action, f"{step.gaussians_before:,}", f"{step.gaussians_after - step.gaussians_before:+,}"]
         for step in report.actions
     ]
-    click.echo(format_table(["action", "Gaussians", "change"], rows))
+    if rows:
+        click.echo(format_table(["action", "Gaussians before", "change"], rows))
     for step in report.actions:
         if step.region_psnr_before is not None:
             click.echo(

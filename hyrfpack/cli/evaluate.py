@@ -10,7 +10,6 @@ import click
 from hyrfpack.choices import AS_PHOTOGRAPHED
 from hyrfpack.cli.common import format_consistent_psnr, format_table, note, print_json, read_scene, scene_options
 from hyrfpack.cli.drawing import drawing_options, largest_picture_size, select_views, split_option
-from hyrfpack.cli.progress import show_progress
 from hyrfpack.cli.types import INPUT_PATH, OUTPUT_FOLDER
 from hyrfpack.counts import format_count
 from hyrfpack.outputs import Outputs
@@ -69,6 +68,7 @@ def evaluate(
     """
     from hyrfpack.evaluate import evaluate_model as score
     from hyrfpack.evaluate import picture_names
+    from hyrfpack.progress import open_display
 
     ranks, source = drawing.ranks, drawing.open(model)
 
@@ -82,7 +82,7 @@ def evaluate(
         return shown, scene, views
 
     shown, scene, views = ranks.run_on_all(read)
-    with show_progress("evaluate") as progress:
+    with open_display("auto", "evaluate") as progress:
         scores = score(
             shown,
             views,

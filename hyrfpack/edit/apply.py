@@ -180,8 +180,8 @@ def _apply_action(action: Action, state: EditState) -> tuple[EditState, ActionRe
     if not keep.any():
         positions = state.world_positions()
         low, high = (corner.round(4).tolist() for corner in (positions.min(axis=0), positions.max(axis=0)))
-        where = f"; their centres lie between {low} and {high}" if isinstance(action, Crop | Remove) else ""
-        raise HyrfError(f"'{action}' would leave no Gaussian{where}", fix="change its numbers")
+        where = f"; all centres lie between {low} and {high}" if isinstance(action, Crop | Remove) else ""
+        raise HyrfError(f"'{action}' would remove every Gaussian{where}", fix="choose another region or limit")
     after = _keep(keep, state)
     return after, replace(report, gaussians_after=len(after.model))
 

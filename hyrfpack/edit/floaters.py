@@ -1,11 +1,9 @@
-"""Floaters: Gaussians that hang in front of the surfaces, and whose light the photos contradict.
+"""Find floaters: Gaussians in front of the surfaces, whose light the photos contradict.
 
-A model alone does not say whether something in the air was there. So all opacities are first reduced where the photos
-ask for it, and nothing else changes. This is a small problem with a clear answer, because a pixel's colour is linear in
-each opacity: what the photos contradict fades. Opacities may not rise, or surfaces would replace each other. A Gaussian
-whose colour is like that of what lies behind it stays, because fading must pay for its light. Of the Gaussians that
-fade, those are floaters that lie in front of the depth that the others show. The rest are needless parts of surfaces,
-which an edit should not touch.
+First only the opacities are fitted to the photos, and they may only fall, because otherwise one surface could replace
+another. A pixel's colour is linear in each opacity, so Gaussians that the photos contradict fade. The loss charges for
+light that is lost, so a Gaussian with the colour of what lies behind it keeps its opacity. Of the faded Gaussians,
+those in front of the depth of the others are floaters. The rest are superfluous parts of surfaces and stay.
 """
 
 from __future__ import annotations

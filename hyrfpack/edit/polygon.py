@@ -70,22 +70,27 @@ def find_inside(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return inside
 
 
-def clean_corners(corners: np.ndarray) -> np.ndarray:
-    """Return the corners (M, 2) of a polygon without repetitions of the corner before, such as a closing first corner.
+def find_corners(corners: np.ndarray) -> np.ndarray:
+    """Return the indices (M,) of the corners of a polygon (N, 2) that do not repeat the one before or close it.
 
     Raises:
         HyrfError: fewer than three corners are left, or two sides of the polygon meet.
     """
-    corners = corners[(corners != np.roll(corners, 1, axis=0)).any(axis=1)]
-    if len(corners) < 3:
+    kept = [0]
+    for index in range(1, len(corners)):
+        if (corners[index] != corners[kept[-1]]).any():
+            kept.append(index)
+    while len(kept) > 1 and (corners[kept[-1]] == corners[0]).all():
+        kept.pop()
+    if len(kept) < 3:
         raise HyrfError("seen from above, the polygon has fewer than three corners", fix="give three or more")
-    if (sides := _find_meeting_sides(corners)) is not None:
-        first, second = sides
+    if (sides := _find_meeting_sides(corners[kept])) is not None:
+        first, second = (kept[side] + 1 for side in sides)
         raise HyrfError(
-            f"seen from above, the side after point {first + 1} of the polygon meets the side after point {second + 1}",
+            f"seen from above, the side after point {first} of the polygon meets the side after point {second}",
             fix="give the points in the order in which one walks around the polygon",
         )
-    return corners
+    return np.array(kept)
 
 
 def _find_meeting_sides(corners: np.ndarray) -> tuple[int, int] | None:

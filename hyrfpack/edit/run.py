@@ -57,8 +57,8 @@ def edit_model(
         part: the part of a merged file that is taken out and edited; None edits all parts together.
         profile: profile of the file to write; None keeps that of `source`, or takes "compact" for a limit.
         limits: largest size or largest loss of the file.
-        data: photos of the scene. Held-out ones are scored before and after, others decide what a floater is, and are
-            what `Refit` trains on.
+        data: photos of the scene. Held-out photos are scored before and after. Training photos decide what a floater
+            is, and `Refit` trains on them.
         picture: a .png or .jpg file to write: the scene before and after, side by side.
         overwrite: replace existing files. If False, an existing file is an error.
         context: progress. Edits run on the CPU.

@@ -24,7 +24,7 @@ from hyrfpack.config.edit import (
 from hyrfpack.data.masks import assign_masks
 from hyrfpack.edit.floaters import find_floaters
 from hyrfpack.edit.masks import share_of_light_in_masks
-from hyrfpack.edit.polygon import clean_corners, find_inside
+from hyrfpack.edit.polygon import find_corners, find_inside
 from hyrfpack.edit.state import EditState
 from hyrfpack.edit.transform import Placement
 from hyrfpack.errors import HyrfError
@@ -80,10 +80,11 @@ def _(action: CropCameras, state: EditState) -> np.ndarray:
 @keep_mask.register
 def _(action: CropPolygon, state: EditState) -> np.ndarray:
     plan, up = np.stack(_horizontal_axes(state.up), axis=1), state.up / np.linalg.norm(state.up)
-    corners, positions = np.array(action.points, np.float64), state.world_positions()
+    points, positions = np.array(action.points, np.float64), state.world_positions()
+    corners = points[find_corners((points - points[0]) @ plan)]
     middle = corners.mean(axis=0)  # far from the origin, coordinates about it are more precise
     heights = (positions - middle) @ up
-    inside = find_inside((positions - middle) @ plan, clean_corners((corners - middle) @ plan))
+    inside = find_inside((positions - middle) @ plan, (corners - middle) @ plan)
     return inside & (heights >= action.min_height) & (heights <= action.max_height)
 
 

@@ -30,7 +30,7 @@ FALLBACK_ALLOWED_ERROR_SHARE = 0.5
 ACCEPTED_ERROR_RATIO = 0.85
 AIMED_ERROR_RATIO = 0.93
 MIN_ERROR_RATIO = 1e-3  # Smaller ratios, also negative ones, are noise.
-# Of log error ratio / log distortion. It is below 1 if few views have most of the error.
+# Smallest d log error ratio / d log distortion; it is below 1 if a few views have most of the error.
 MIN_LOG_SLOPE = 0.4
 MAX_LOG_STEP = np.log(16)
 MAX_TRIALS = 6

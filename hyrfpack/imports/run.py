@@ -173,7 +173,8 @@ def import_loaded_splats(
             device=device,
             progress=part_of_progress(progress, 0.0, 0.7),
         )
-        unpacked_psnr = float(np.mean(prepared.test.psnr_per_view(prepared.model)))
+        unpacked_scores = prepared.test.psnr_per_view(prepared.model)
+        unpacked_psnr = float(np.mean(unpacked_scores))
         _LOG.info(f"PSNR before compression: {unpacked_psnr:.2f} dB")
         imported = (
             f"{format_count(len(splats), 'Gaussian')} of degree {splats.degree} from {Path(name).name}, without photos"
@@ -195,9 +196,11 @@ def import_loaded_splats(
     if config.target_bytes is None and _falls_short(reached_psnr, config.target_psnr):
         _LOG.warning(_shortfall(reached_psnr, unpacked_psnr, config, has_cameras=cameras is not None))
     if config.worst is not None and _falls_short(min(scores), config.worst):
+        is_reachable = not _falls_short(min(unpacked_scores), config.worst)
+        advice = "set a higher `worst`" if is_reachable else "so does the model before compression; set a lower `worst`"
         _LOG.warning(
-            f"the worst view is to have {config.worst:g} dB, but the worst of the held-out ones has {min(scores):.1f} "
-            "dB; set a higher `worst`"
+            f"the target PSNR of the worst view is {config.worst:g} dB, but the worst held-out view has "
+            f"{min(scores):.1f} dB; {advice}"
         )
     return ImportReport(
         gaussians_before=len(splats),

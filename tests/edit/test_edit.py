@@ -388,10 +388,10 @@ def test_the_command_turns_a_scene_upright_and_says_how(tmp_path):
 
 def test_an_edit_that_leaves_nothing_is_refused_and_writes_nothing(tmp_path):
     sentence = refused("edit", COMPACT_FILE, "-o", tmp_path / "out.hyrf", "--crop-box", "90,90,90,91,91,91")
-    assert "would leave no Gaussian; their centres lie between" in sentence
+    assert "would remove every Gaussian; all centres lie between" in sentence
     assert list(tmp_path.iterdir()) == []
     sentence = refused("edit", COMPACT_FILE, "-o", tmp_path / "out.hyrf", "--min-opacity", "1")
-    assert "'remove opacities below 1' would leave no Gaussian; change" in sentence
+    assert "'remove opacities below 1' would remove every Gaussian; choose" in sentence
 
 
 @pytest.mark.parametrize(

@@ -129,7 +129,7 @@ def test_masks_that_cannot_be_used_are_a_clear_error(photos, masks, tmp_path):
 def test_black_masks_are_refused_because_nothing_is_left(scene, masks, tmp_path):
     for path in masks.iterdir():
         Image.new("L", (48, 48)).save(tmp_path / path.name)
-    with pytest.raises(HyrfError, match="would leave no Gaussian"):
+    with pytest.raises(HyrfError, match="would remove every Gaussian"):
         plan_edit(DEMO_MODEL_FILE, [CropMasks(str(tmp_path))], data=scene, context=QUIET_CONTEXT)
 
 

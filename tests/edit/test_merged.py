@@ -213,7 +213,7 @@ def test_a_message_about_a_part_that_cannot_be_compressed_names_file_and_part(me
 
 
 def test_an_edit_that_leaves_nothing_is_refused(merged, tmp_path):
-    with pytest.raises(HyrfError, match="would leave no Gaussian"):
+    with pytest.raises(HyrfError, match="would remove every Gaussian"):
         edit_model(merged, tmp_path / "out.hyrf", [CropSphere((50, 0, 0), 1)], context=QUIET_CONTEXT)
     assert not list(tmp_path.iterdir())
 
@@ -304,4 +304,4 @@ def test_the_command_edits_all_parts(merged, tmp_path):
 
     assert report["actions"][0]["gaussians_after"] == SELECTION_CASES["box"][1](World(merged)).sum()
     error = refused("edit", merged, "-o", tmp_path / "no.hyrf", "--crop-sphere", "50,0,0,1")
-    assert "would leave no Gaussian" in error and not (tmp_path / "no.hyrf").exists()
+    assert "would remove every Gaussian" in error and not (tmp_path / "no.hyrf").exists()

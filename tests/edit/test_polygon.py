@@ -16,7 +16,7 @@ from scenes import QUIET_CONTEXT
 
 from hyrfpack.config.edit import CropPolygon, Remove, Translate, Up
 from hyrfpack.edit import plan_edit
-from hyrfpack.edit.polygon import clean_corners, find_inside, read_polygon
+from hyrfpack.edit.polygon import find_corners, find_inside, read_polygon
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.format import load_model
 
@@ -54,7 +54,7 @@ def test_an_l_shape_is_the_union_of_two_rectangles():
     points = np.random.default_rng(0).uniform(-1, 5, (4000, 2))
     x, y = points.T
     expected = ((0 < x) & (x < 4) & (0 < y) & (y < 1)) | ((0 < x) & (x < 1) & (0 < y) & (y < 3))
-    assert (find_inside(points, clean_corners(L_SHAPE)) == expected).all() and 0 < expected.sum() < len(points)
+    assert (find_inside(points, L_SHAPE) == expected).all() and 0 < expected.sum() < len(points)
 
 
 # -- sides that meet --------------------------------------------------------------------------------------------------
@@ -91,20 +91,23 @@ def test_polygons_are_refused_exactly_if_two_of_their_sides_meet(points):
     ) or any(leads_back(corners[i - 1], corners[i], corners[(i + 1) % count]) for i in range(count))
     if meet:
         with pytest.raises(HyrfError, match="meets the side after point"):
-            clean_corners(corners)
+            find_corners(corners)
     else:
-        assert (clean_corners(corners) == corners).all()
+        assert find_corners(corners).tolist() == list(range(count))
+
+
+@pytest.mark.parametrize("closing", [0, 1, 2])
+def test_messages_number_the_points_as_they_were_given(closing):
+    corners = np.array([(0, 0), (1, 1), (1, 0), (0, 1)], float)
+    with pytest.raises(HyrfError, match="the side after point 1 .* the side after point 3"):
+        find_corners(np.concatenate((corners, np.repeat(corners[:1], closing, axis=0))))
 
 
 def test_a_closing_corner_and_repetitions_are_dropped():
     closed = np.concatenate((L_SHAPE[:2], L_SHAPE[1:], L_SHAPE[:1]))
-    assert rows(clean_corners(closed)) == rows(L_SHAPE)
+    assert find_corners(closed).tolist() == [0, 1, *range(3, len(closed) - 1)]
     with pytest.raises(HyrfError, match="fewer than three corners"):
-        clean_corners(np.array([(0, 0), (1, 0), (1, 0), (0, 0)], float))
-
-
-def rows(corners: np.ndarray) -> list[tuple[float, ...]]:
-    return sorted(map(tuple, corners.tolist()))
+        find_corners(np.array([(0, 0), (1, 0), (1, 0), (0, 0)], float))
 
 
 # -- edits ------------------------------------------------------------------------------------------------------------
