@@ -6,6 +6,7 @@ import logging
 import os
 from pathlib import Path
 
+from hyrfpack.atomic import write_atomic
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
@@ -13,7 +14,9 @@ from hyrfpack.lock import exclusive_folder
 from hyrfpack.make.source import LoadSettings, Source
 from hyrfpack.make.stage_cache import interruptible
 from hyrfpack.make.stages import SCENE_FOLDER, is_posed
+from hyrfpack.make.state import files_digest
 
+SOURCE_RECORD = "photos.digest"  # in the scene's folder: the digest of the photos that its poses were estimated from
 _LOG = logging.getLogger(__name__)
 
 
@@ -40,8 +43,8 @@ def auto_pose(
         The folder of the scene.
 
     Raises:
-        HyrfError: the folder may not or cannot be written, is in use by another call, or has a run; or the poses
-            cannot be estimated.
+        HyrfError: the folder may not or cannot be written, is in use by another call, has a run, or has poses of other
+            photos; or the poses cannot be estimated.
         KeyboardInterrupt: the estimation was interrupted; the same call resumes it.
     """
     scene, source = run / SCENE_FOLDER, Source.from_path(photos, LoadSettings(images))
@@ -50,7 +53,7 @@ def auto_pose(
         raise HyrfError(f"{run}: the run would lie among the photos", fix="name another folder")
     with exclusive_folder(run):
         _check_run_folder(source, run, overwrite=overwrite or resume)
-        _estimate_unless_posed(source.path, scene, overwrite, context)
+        _estimate_unless_posed(source, scene, overwrite, context)
     return scene
 
 
@@ -60,14 +63,25 @@ def _check_run_folder(source: Source, run: Path, *, overwrite: bool) -> None:
         outputs.folder(run, [MODEL_FILE, CHECKPOINT_FILE, METRICS_FILE])
 
 
-def _estimate_unless_posed(photos: Path, scene: Path, overwrite: bool, context: RunContext) -> None:
-    """Estimate poses into the folder of a scene, unless it has poses and `overwrite` is not set."""
+def _estimate_unless_posed(source: Source, scene: Path, overwrite: bool, context: RunContext) -> None:
+    """Estimate poses into the folder of a scene, unless it has poses and `overwrite` is not set.
+
+    Raises:
+        HyrfError: the poses there are of other photos, or the poses cannot be estimated.
+    """
     from hyrfpack.poses import estimate_poses
 
+    digest, record = files_digest(source.files(), source.path), scene / SOURCE_RECORD
     if is_posed(scene) and not overwrite:
+        if record.is_file() and record.read_text() != digest:
+            raise HyrfError(
+                f"{scene}: these poses were estimated from other photos, or the photos have changed",
+                fix="choose another folder, or estimate them anew with `overwrite=True`",
+            )
         _LOG.info(
             f"poses are taken from {scene}, where they were estimated before; `overwrite=True` estimates them anew"
         )
         return
     with interruptible():
-        estimate_poses(photos, scene, overwrite=overwrite, context=context)
+        estimate_poses(source.path, scene, overwrite=overwrite, context=context)
+        write_atomic(record, digest.encode())
