@@ -49,6 +49,7 @@ def unpack(archive: Path) -> Path:
 
     Raises:
         HyrfDataError: the archive is damaged, encrypted or hostile, or the disk has no room for its files.
+        HyrfError: there is no folder to unpack it into.
     """
     try:
         with zipfile.ZipFile(archive) as content:
@@ -58,7 +59,7 @@ def unpack(archive: Path) -> Path:
                 _write_entries(archive, content, entries, folder)
             _archive_by_folder[folder] = archive
             return folder / _common_folder(entries)
-    except HyrfDataError:
+    except HyrfError:
         raise
     except OSError as error:
         raise HyrfDataError(

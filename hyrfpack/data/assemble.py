@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Sequence, Set
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -141,9 +142,12 @@ def _cut_panoramas(photos: list[Photo], held_out: Set[str]) -> tuple[list[Photo]
 
 
 def _list_raw_photos_beside(photos: list[Photo]) -> list[Path]:
-    """List the raw files in the folders of the photos."""
-    folders = sorted({photo.path.parent for photo in photos})
-    return [folder / name for folder in folders for name in os.listdir(folder) if is_raw_name(name)]
+    """List the raw files in the folders of the photos, as far as these folders may be listed."""
+    found: list[Path] = []
+    for folder in sorted({photo.path.parent for photo in photos}):
+        with suppress(OSError):
+            found += [folder / name for name in os.listdir(folder) if is_raw_name(name)]
+    return found
 
 
 def _loading_notes(photos: list[Photo], max_size: int, mask_notes: list[str]) -> list[str]:

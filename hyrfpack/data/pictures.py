@@ -20,6 +20,7 @@ from hyrfpack.outputs import RAW_PHOTO_SUFFIXES, READABLE_PICTURE_SUFFIXES
 from hyrfpack.scene import Picture
 
 if TYPE_CHECKING:
+    from PIL.Image import Image as PilImage
     from PIL.ImageFile import ImageFile
 
 _SIXTEEN_BIT_MODES = ("I", "I;16", "I;16B", "I;16L", "I;16N")
@@ -211,6 +212,14 @@ def read_orientation(path: Path) -> int:
     return orientation if orientation in _TRANSPOSITIONS else 1
 
 
+def turn_upright(image: PilImage, orientation: int) -> PilImage:
+    """Return a picture turned from its EXIF orientation (1 to 8) to upright; other values leave it as it is."""
+    from PIL import Image
+
+    number = _TRANSPOSITIONS.get(orientation)
+    return image if number is None else image.transpose(Image.Transpose(number))
+
+
 def is_tagged_panorama(path: Path) -> bool:
     """Return whether the XMP data of a picture file declare an equirectangular panorama (Google's GPano).
 
@@ -273,9 +282,7 @@ def read_pixels(
                 picture = picture.transpose(Image.Transpose(_TRANSPOSITIONS[inverse]))
             if stored is not None:
                 picture = picture.resize(stored, Image.Resampling.LANCZOS, box=None if draft is None else draft[1])
-            if orientation != 1:
-                picture = picture.transpose(Image.Transpose(_TRANSPOSITIONS[orientation]))
-            pixels = np.array(picture)
+            pixels = np.array(turn_upright(picture, orientation))
         except Exception as error:  # Pillow's decoders raise exceptions of many types
             shown = display_path(path)
             raise HyrfDataError(

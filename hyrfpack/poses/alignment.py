@@ -123,11 +123,15 @@ def align_poses(a: Poses, b: Poses) -> PoseAlignment:
 
 def _sample_camera_pairs(count: int) -> np.ndarray:
     """Return all pairs of cameras, or a random sample if there are too many: (pairs, 2)."""
-    first, second = np.triu_indices(count, 1)
-    if len(first) > _MAX_CANDIDATE_PAIRS:
-        chosen = np.random.default_rng(0).choice(len(first), _MAX_CANDIDATE_PAIRS, replace=False)
-        first, second = first[chosen], second[chosen]
-    return np.stack([first, second], axis=1)
+    pairs = count * (count - 1) // 2
+    chosen = np.arange(pairs)
+    if pairs > _MAX_CANDIDATE_PAIRS:
+        chosen = np.random.default_rng(0).choice(pairs, _MAX_CANDIDATE_PAIRS, replace=False)
+    # Pairs are numbered (0, 1), (0, 2), ... (1, 2), ...; camera i is the first of count - 1 - i pairs.
+    firsts = np.arange(count)
+    starts = firsts * (2 * count - firsts - 1) // 2
+    first = np.searchsorted(starts, chosen, side="right") - 1
+    return np.stack([first, chosen - starts[first] + first + 1], axis=1)
 
 
 def _fit_similarity(

@@ -98,8 +98,8 @@ def describe_doubt(poses: Poses, other: Candidate | None) -> str:
     in_other_pieces = len(set().union(*other.other_pieces).intersection(poses).difference(agreed))
     unlike = len(poses) - len(agreed) - lacking - in_other_pieces
     parts = [f"gives {format_count(unlike, 'photo')} other poses"] if unlike > 0 else []
-    parts += [f"has {in_other_pieces} in other pieces"] if in_other_pieces else []
-    parts += [f"has no pose for {lacking}"] if lacking else []
+    parts += [f"has {format_count(in_other_pieces, 'photo')} in separate reconstructions"] if in_other_pieces else []
+    parts += [f"has no pose for {format_count(lacking, 'photo')}"] if lacking else []
     return (
         f"{len(agreed)} of {len(poses)} poses are confirmed by both mappers; {_MAPPER_NAMES[other.mapper]} "
         f"{' and '.join(parts)}, so check the result before you use it"

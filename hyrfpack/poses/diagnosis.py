@@ -71,8 +71,8 @@ def check_features(folder: Path, count: int, features: Mapping[str, Any], unread
         raise unreadable_error(folder, unreadable, count)
     if np.median(counts) < _MIN_TYPICAL_FEATURES:
         raise HyrfDataError(
-            f"{folder}: there is hardly anything in these photos that can be recognised in another (a typical one has "
-            f"{int(np.median(counts))} features)",
+            f"{folder}: these photos have too few features (median {int(np.median(counts))}, at least "
+            f"{_MIN_TYPICAL_FEATURES} are needed)",
             fix="take sharp, well lit photos of things that have texture",
         )
 
@@ -85,10 +85,10 @@ def check_matches(folder: Path, count: int, matches: Mapping[str, Any]) -> None:
     """
     if len(matches["matched"]) < MIN_PHOTOS:
         pairs = format_count(
-            matches["pairs"], f"pair of these {count} photos shows", f"pairs of these {count} photos show"
+            matches["pairs"], f"pair of these {count} photos has", f"pairs of these {count} photos have"
         )
         raise HyrfDataError(
-            f"{folder}: {pairs} the same thing",
+            f"{folder}: {pairs} enough matches",
             fix="take sharp photos of one scene, each sharing two thirds of its view with the next",
         )
     if matches["turned"] >= _MIN_PANORAMA_PAIR_RATIO:
@@ -130,12 +130,12 @@ def explain_unposed(
 
     def reason(name: str) -> str:
         if name in found["apart"]:
-            return "belongs to a piece of its own, which too little joins to the rest"
+            return "belongs to a separate reconstruction, because too few matches connect it to the other photos"
         if (
             features["keypoints"].get(name, 0) < _MIN_TYPICAL_FEATURES
             and features["sharpness"].get(name, 0) < _MIN_CONTENT_SHARPNESS
         ):
-            return "nothing in it that can be recognised"
+            return "too few features"
         if name in soft:
             return "blurred"
         if name not in matches["matched"]:

@@ -43,8 +43,9 @@ def sequential_pairs(count: int, similarity: np.ndarray) -> Pairs:
     """
     steps = [*range(1, _SEQUENTIAL_NEIGHBOURS + 1), *(2**power for power in range(4, 12))]
     pairs = {(first, first + step) for step in steps for first in range(count - step)}
-    far = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) > _SEQUENTIAL_NEIGHBOURS
-    return sorted(pairs | _most_similar_pairs(np.where(far, similarity, -np.inf), _LOOP_CLOSURE_PHOTOS))
+    return sorted(
+        pairs | _most_similar_pairs(similarity, _LOOP_CLOSURE_PHOTOS, min_distance=_SEQUENTIAL_NEIGHBOURS + 1)
+    )
 
 
 def retrieval_pairs(count: int, similarity: np.ndarray) -> Pairs:
@@ -57,12 +58,12 @@ def retrieval_pairs(count: int, similarity: np.ndarray) -> Pairs:
     return sorted(neighbours | _most_similar_pairs(similarity, similar))
 
 
-def _most_similar_pairs(similarity: np.ndarray, most: int) -> set[tuple[int, int]]:
-    """Pair each photo with at most `most` photos of the highest finite similarity."""
+def _most_similar_pairs(similarity: np.ndarray, most: int, min_distance: int = 1) -> set[tuple[int, int]]:
+    """Pair each photo with at most `most` of the highest finite similarity, at least `min_distance` places away."""
     pairs = set()
     for photo, row in enumerate(similarity):
         row = row.copy()
-        row[photo] = -np.inf
+        row[max(0, photo - min_distance + 1) : photo + min_distance] = -np.inf
         for other in np.argsort(-row, kind="stable")[:most]:
             if np.isfinite(row[other]):
                 pairs.add((min(photo, int(other)), max(photo, int(other))))

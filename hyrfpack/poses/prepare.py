@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image
 
 from hyrfpack.copying import copy_file
 from hyrfpack.data import masks as mask_files
@@ -21,7 +21,7 @@ from hyrfpack.data.archive import display_path
 from hyrfpack.data.equirectangular import CUBE_FACES, Face, FaceFile, cut_panorama, face_lens, face_size, is_panorama
 from hyrfpack.data.folder import PhotoFacts, read_photo_facts
 from hyrfpack.data.masks import MaskMatches, check_mask_shape
-from hyrfpack.data.pictures import open_picture, read_header
+from hyrfpack.data.pictures import open_picture, read_header, turn_upright
 from hyrfpack.data.unusable import INVALID_NAME_REASON
 from hyrfpack.errors import HyrfDataError, short_reason, strip_path
 from hyrfpack.parallel.threads import thread_count
@@ -94,7 +94,8 @@ def read_headers(
     """
     photos: list[Photo] = []
     left_out: dict[str, str] = {}
-    taken = {path.relative_to(root).as_posix() for path in files}  # names that faces and rewritten photos must not get
+    # Names that faces and rewritten photos must not get. Some file systems do not tell capital from small letters.
+    taken = {path.relative_to(root).as_posix().casefold() for path in files}
     first_with: dict[tuple[int, str], str] = {}
     sizes = Counter(path.stat().st_size for path in files)
     found = _map_on_threads(_read_facts_or_reason, files, progress, "reading the headers of photos", len(files))
@@ -124,8 +125,9 @@ def read_headers(
                     fix="put the panoramas into a folder of their own, and choose another folder for the scene",
                 )
             faces = _make_faces(facts, source)
-            if taken.isdisjoint(face.name for face in faces):
-                taken.update(face.name for face in faces)
+            names = {face.name.casefold() for face in faces}
+            if taken.isdisjoint(names):
+                taken |= names
                 photos += faces
             else:
                 left_out[source] = _FACE_NAME_TAKEN_REASON
@@ -133,7 +135,7 @@ def read_headers(
         photo = Photo(source, facts, source)
         if not (in_place or photo.is_usable_unchanged):
             photo = Photo(_rewritten_name(source, taken), facts, source)
-            taken.add(photo.name)
+            taken.add(photo.name.casefold())
         photos.append(photo)
     return sorted(photos, key=lambda photo: photo.name), left_out
 
@@ -249,8 +251,7 @@ def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) ->
             stored = photo.facts.size[::-1] if photo.facts.orientation >= 5 else photo.facts.size
             turned = photo.facts.orientation != 1 and image.size == stored
             if turned:
-                image.getexif()[_EXIF_ORIENTATION_TAG] = photo.facts.orientation
-                ImageOps.exif_transpose(image).save(target)
+                turn_upright(image, photo.facts.orientation).save(target)
             elif mask.suffix.lower() == ".png":
                 copy_file(mask, target, keep_metadata=True)
             else:
@@ -308,16 +309,24 @@ def _make_faces(facts: PhotoFacts, source: str) -> list[Photo]:
 
 
 def _rewritten_name(source: str, taken: set[str]) -> str:
-    """Return a free name, with the ending of its new format, for a photo that is rewritten."""
+    """Return a free name, with the ending of its new format, for a photo that is rewritten; `taken` is casefolded."""
     path = PurePosixPath(source)
     ending = ".jpg" if path.suffix.lower() in _SUFFIXES_WRITTEN_AS_JPEG else ".png"
     if path.suffix.lower() in (ending, ".jpeg"):
         return source
     name = path.with_suffix(ending).as_posix()
-    while name in taken:
+    while name.casefold() in taken:
         source += ending
         name = source
     return name
+
+
+def _remaining_orientation(image: Image.Image) -> int:
+    """Return the EXIF orientation of a decoded picture; 1 if Pillow has applied it, or the tags are damaged."""
+    try:
+        return int(image.getexif().get(_EXIF_ORIENTATION_TAG, 1))
+    except Exception:  # Pillow raises many types of errors for damaged tags
+        return 1
 
 
 def _write_photo(photo: Photo, target: Path) -> None:
@@ -327,12 +336,15 @@ def _write_photo(photo: Photo, target: Path) -> None:
         return
     with open_picture(photo.facts.path) as image:
         try:
-            upright = ImageOps.exif_transpose(image)
+            image.load()
         except Exception:  # Pillow's decoders raise many types of errors
-            upright = None
-        if upright is None or upright.mode == "F":  # undecodable: the feature stage leaves it out
+            is_decoded = False
+        else:
+            is_decoded = image.mode != "F"
+        if not is_decoded:  # the feature stage leaves it out
             copy_file(photo.facts.path, target, keep_metadata=True)
             return
+        upright = turn_upright(image, _remaining_orientation(image))
         jpeg = target.suffix.lower() in (".jpg", ".jpeg")
         modes = ("L", "RGB") if jpeg else _PNG_MODES
         profile = image.info.get("icc_profile")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 from contextlib import suppress
@@ -134,14 +133,14 @@ def _crash_error(stage: str, code: int, log: Path) -> StageCrashedError:
         return StageCrashedError(
             f"{log.parent}: the disk is full", fix="free some space and run the same command again, which resumes here"
         )
-    if "MemoryError" in text or "bad_alloc" in text or code == -signal.SIGKILL:
+    if "MemoryError" in text or "bad_alloc" in text or (code < 0 and signal_name(code) == "SIGKILL"):
         return StageCrashedError(
             f"{log.parent}: {doing} took more memory than there is",
             fix="close other programs and run the same command again, which resumes here",
         )
     how = f"by {signal_name(code)}" if code < 0 else f"with code {code}"
-    last = next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "it said nothing")
+    last = next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "no message in the log")
     return StageCrashedError(
         f"{log.parent}: {doing} ended {how} ({last[-160:]})",
-        fix=f"run the same command again, which resumes here, and report it with {log.name} if it ends so again",
+        fix=f"run the same command again, which resumes here; if it fails again, report it and attach {log.name}",
     )

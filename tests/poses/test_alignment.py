@@ -7,7 +7,15 @@ import pytest
 from made_up_poses import circle_poses, line_poses, transform_poses
 from scipy.spatial.transform import Rotation
 
-from hyrfpack.poses.alignment import align_poses, camera_extent, camera_positions
+from hyrfpack.poses.alignment import _sample_camera_pairs, align_poses, camera_extent, camera_positions
+
+
+@pytest.mark.parametrize("count", [2, 3, 50, 90, 91, 700])
+def test_compared_pairs_are_all_or_a_sample_without_repetitions(count):
+    pairs = _sample_camera_pairs(count)
+    everything = count * (count - 1) // 2
+    assert len(pairs) == min(everything, 4000) == len(set(map(tuple, pairs.tolist())))
+    assert (pairs[:, 0] < pairs[:, 1]).all() and pairs.min() >= 0 and pairs.max() < count
 
 
 @pytest.mark.parametrize("poses", [circle_poses(), line_poses()])

@@ -171,7 +171,8 @@ def test_a_crash_of_the_library_is_a_clear_error(photos_and_poses, tmp_path, mon
 def test_a_signal_without_a_name_is_reported_by_its_number(tmp_path):
     """Real-time signals have no names in Python, but for the first and the last."""
     error = process._crash_error("matches", -40, tmp_path / "matches.log")
-    assert "matching photos ended by signal 40 (it said nothing)" in str(error)
+    assert "matching photos ended by signal 40 (no message in the log)" in str(error)
+    assert "more memory than there is" in process._crash_error("matches", -signal.SIGKILL, tmp_path / "no.log").problem
     assert process._crash_error("matches", -signal.SIGABRT, tmp_path / "matches.log").problem.count("by SIGABRT") == 1
 
 

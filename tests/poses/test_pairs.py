@@ -48,8 +48,13 @@ def test_sequential_matching_closes_loops():
     count = 60
     similar = np.zeros((count, count))
     similar[2, 57] = similar[57, 2] = 1.0
+    similar[20, 31] = similar[31, 20] = 1.0
+    similar[:40, 40:] = similar[40:, :40] = -np.inf  # only finite similarities count
+    similar[2, 57] = similar[57, 2] = 0.5
     pairs = sequential_pairs(count, similar)
-    assert {(0, 1), (0, 10), (0, 16), (2, 57)} <= set(pairs)
+    assert {(0, 1), (0, 10), (0, 16), (2, 57), (20, 31)} <= set(pairs)
+    near = np.where(np.abs(np.subtract.outer(range(count), range(count))) <= 10, 1.0, -np.inf)
+    assert {second - first for first, second in sequential_pairs(count, near)} == {*range(1, 11), 16, 32}
     assert all(first < second for first, second in pairs) and len(set(pairs)) == len(pairs)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_up_photos import PHOTO_SIZE, write_photos
-from PIL import Image
+from PIL import Image, TiffImagePlugin
 
 import hyrfpack
 from hyrfpack.copying import copy_file
@@ -138,6 +138,27 @@ def test_a_photo_with_only_a_complete_header_is_omitted_also_as_a_panorama(tmp_p
     photos, left_out = read_photo_headers(tmp_path)
     assert [photo.name for photo in photos] == ["b.jpg"]
     assert left_out["a.jpg"].startswith("cannot decode the picture")
+
+
+def test_a_rotated_photo_with_a_damaged_tag_is_written_upright(tmp_path):
+    """Pillow cannot write a resolution that is text, but reads the orientation beside it."""
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags.tagtype[0x011A], tags[0x011A], tags[0x0112] = 2, "72", 6
+    stored = Image.fromarray(np.ascontiguousarray(np.rot90(upright_picture(), QUARTER_TURNS_BY_ORIENTATION[6])))
+    (tmp_path / "in").mkdir()
+    stored.save(tmp_path / "in" / "a.jpg", quality=95, exif=b"Exif\0\0II*\0\x08\0\0\0" + tags.tobytes(8))
+    photos, _ = read_photo_headers(tmp_path / "in")
+    make_images(photos, tmp_path / "out")
+    assert photos[0].facts.size == upright_picture().shape[1::-1]
+    with Image.open(tmp_path / "out" / "a.jpg") as image:
+        assert np.abs(np.asarray(image).astype(float) - upright_picture()).mean() <= 6
+
+
+def test_rewritten_photos_get_no_name_that_differs_only_in_capital_letters(tmp_path):
+    save_photo(tmp_path / "in" / "A.JPG", upright_picture(0))
+    save_photo(tmp_path / "in" / "a.webp", upright_picture(1), 6)
+    photos, _ = read_photo_headers(tmp_path / "in")
+    assert len({photo.name.casefold() for photo in photos}) == 2
 
 
 def test_photos_that_differ_only_in_their_ending_keep_different_names(tmp_path):
