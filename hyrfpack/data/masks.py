@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,6 +13,8 @@ from hyrfpack.data.names import PictureIndex
 from hyrfpack.data.pictures import PhotoFile, has_same_aspect, is_picture_name, read_header
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import View
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -33,8 +36,10 @@ def find_mask_folder(root: Path, picture_folder: str) -> Path:
     return root / f"masks{suffix}" if suffix and (root / f"masks{suffix}").is_dir() else root / "masks"
 
 
-def find_masks(folder: Path, photos: Sequence[tuple[str, tuple[int, int]]], used: set[Path]) -> MaskMatches:
-    """Find the masks of photos by their names, or the only mask, which then applies to all photos.
+def find_masks(
+    folder: Path, photos: Sequence[tuple[str, tuple[int, int]]], used: set[Path], *, allow_shared: bool = True
+) -> MaskMatches:
+    """Find the masks of photos by their names, or a single mask for all photos.
 
     A mask has its photo's name, with ".png" added, with another extension, or in another spelling that `PictureIndex`
     accepts.
@@ -43,6 +48,7 @@ def find_masks(folder: Path, photos: Sequence[tuple[str, tuple[int, int]]], used
         folder: the folder of masks. If it does not exist, a file called "mask" beside it is the mask of all photos.
         photos: name and (width, height) of each photo that needs a mask.
         used: masks that the poses name themselves.
+        allow_shared: whether a single mask, which has the name of no photo, applies to all photos.
     """
     index = PictureIndex(folder, photos=False)
     unmatched = [file for file in index.files if file not in used]
@@ -50,7 +56,7 @@ def find_masks(folder: Path, photos: Sequence[tuple[str, tuple[int, int]]], used
     by_photo = index.match(names).found if unmatched else {}
     matched = set(by_photo.values())
     unmatched = [file for file in unmatched if file not in matched]
-    if by_photo or used:
+    if by_photo or used or not allow_shared:
         return MaskMatches(by_photo, _unmatched_mask_notes(folder, unmatched, len(index.files), names))
     for_all = unmatched
     if not folder.is_dir():
@@ -78,20 +84,22 @@ def assign_masks(views: Sequence[View], folder: Path) -> list[View]:
 
     Args:
         views: views of photos on disk.
-        folder: the folder of masks, which are found by name as by `find_masks`.
+        folder: the folder of masks, which are found by name as by `find_masks`. Masks that match no photo are logged.
 
     Raises:
         HyrfDataError: the folder has no mask of these photos, or a mask has another aspect ratio than its photo.
     """
     loaders = {view.name: view.load for view in views if isinstance(view.load, PhotoFile | FaceFile)}
     sizes = [(name, load.stored) for name, load in loaders.items()]
-    found = find_masks(folder, sizes, set()) if folder.is_dir() else MaskMatches()
+    found = find_masks(folder, sizes, set(), allow_shared=False) if folder.is_dir() else MaskMatches()
     if not found.by_photo:
         example = f", such as {Path(views[0].name).stem}.png" if views else ""
         raise HyrfDataError(
             f"{folder}: {'no mask has the name of a photo' if folder.is_dir() else 'there is no such folder'}",
             fix=f"name a folder with masks that have their photos' names{example}",
         )
+    for note in found.notes:
+        _LOG.warning(note)
     masked = []
     for view in views:
         if (mask := found.by_photo.get(view.name)) is not None:

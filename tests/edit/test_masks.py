@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +125,20 @@ def test_masks_that_cannot_be_used_are_a_clear_error(photos, masks, tmp_path):
     first = next(iter(masks.iterdir())).name
     Image.new("L", (48, 20)).save(missing / first)
     assert "the mask is 48 x 20 but its photo 48 x 48" in refused(*command, missing, "--data", photos)
+
+
+def test_a_single_mask_does_not_apply_to_all_photos(photos, tmp_path):
+    Image.new("L", (48, 48), 255).save(tmp_path / "mask.png")
+    assert "no mask has the name of a photo" in refused(
+        "edit", DEMO_MODEL_FILE, "--plan", "--crop-masks", tmp_path, "--data", photos
+    )
+
+
+def test_masks_of_no_photo_are_reported(photos, masks, tmp_path):
+    shutil.copytree(masks, tmp_path / "masks")
+    Image.new("L", (48, 48), 255).save(tmp_path / "masks" / "other.png")
+    result = succeeded("edit", DEMO_MODEL_FILE, "--plan", "--crop-masks", tmp_path / "masks", "--data", photos)
+    assert "masks matches no photo of the scene (such as other.png)" in result.stderr
 
 
 def test_black_masks_are_refused_because_nothing_is_left(scene, masks, tmp_path):
