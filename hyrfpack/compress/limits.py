@@ -65,7 +65,7 @@ def encode_within_bytes(
     )
     if (smallest := len(candidate.data)) > limit:
         raise HyrfSizeError(
-            f"the model does not fit into {limit:,} bytes, and the smallest possible size is about {smallest:,} bytes",
+            f"the model does not fit into {limit:,} bytes: with the coarsest numbers it still takes {smallest:,} bytes",
             fix="use a larger `target_bytes`, or train with fewer Gaussians (`max_gaussians`)",
             min_bytes=smallest,
         )

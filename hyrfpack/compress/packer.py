@@ -158,6 +158,7 @@ class Packer:
             error_ratio = error / target
             if error_ratio == 0 or 1 / DISTORTION_TOLERANCE_RATIO < error_ratio < DISTORTION_TOLERANCE_RATIO:
                 break
+            before = distortion
             distortion /= min(max(error_ratio, 1 / MAX_COARSENING_RATIO), MAX_REFINING_RATIO)
             kind = "finer" if error_ratio > 1 else "coarser"
             _LOG.info(
@@ -172,7 +173,7 @@ class Packer:
             return (
                 (other, distortion)
                 if other.measured_error < DISTORTION_TOLERANCE_RATIO * target
-                else (candidate, target)
+                else (candidate, before)
             )
         return candidate, distortion
 

@@ -275,6 +275,28 @@ def test_the_distortion_is_adjusted_until_the_measured_error_matches(
     assert trial.data == pytest.approx(expected) and trial.measured_error == picture_error(trial.data)
 
 
+def test_after_a_rejected_coarser_file_the_distortion_is_that_of_the_file(monkeypatch):
+    """The drop on training photos is then lowered from the distortion that the file was planned for."""
+    tried: list[float] = []
+    errors = {1e-3: 2e-2, 6.25e-5: 5e-4, 1.25e-4: 1e-1}
+    packer = running.Packer(None, {}, None, SimpleNamespace(train=["a photo"]))
+    monkeypatch.setattr(
+        packer, "encode", lambda distortion, *_: tried.append(distortion) or running.EncodedCandidate(distortion, {})
+    )
+    monkeypatch.setattr(running.Packer, "decode", lambda packer, trial: trial.data)
+    drops = iter([0.2, 0.1])
+    monkeypatch.setattr(
+        running,
+        "evaluate_model",
+        lambda shown, views, progress: SimpleNamespace(psnr=30.0 if shown is None else 30.0 - next(drops)),
+    )
+    references = SimpleNamespace(measure_error=lambda distortion: errors.get(round(distortion, 9), 1e-4))
+
+    packer.encode_to_distortion(1e-3, references, 0.1)
+
+    assert tried == pytest.approx([1e-3, 6.25e-5, 1.25e-4, 6.25e-5 / 2])
+
+
 @pytest.mark.parametrize(
     ("psnr_drop", "expected_trials", "expected"),
     [
