@@ -158,7 +158,7 @@ def _find_set(folder: Path, layout: str | None, notes: list[str]) -> tuple[Path,
 
     inside = None if holds(folder) else find_set(folder, holds)
     if inside is not None:
-        notes.append(f"the set in {inside.relative_to(folder)} is used")
+        notes.append(f"the photos and poses in {inside.relative_to(folder)} are used")
     return inside or folder, _layouts_in(inside or folder)
 
 

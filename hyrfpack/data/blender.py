@@ -27,13 +27,13 @@ def read_blender(path: Path, *, test_every: int, max_size: int) -> Scene:
     held_out = next((split for split in ("test", "val") if (path / f"transforms_{split}.json").is_file()), None)
     test_names = None
     if held_out is None:
-        notes.append("the set has no split of its own")
+        notes.append("there is no transforms_test.json or transforms_val.json, so held-out photos are chosen by number")
     else:
         test = _read_split(path, held_out, notes)
         test_names = {photo.name for photo in test}
         photos += test
         if held_out == "val":
-            notes.append("the set has no test split; val is used")
+            notes.append("there is no transforms_test.json; the photos of transforms_val.json are held out")
     tables = [path / f"transforms_{split}.json" for split in ("train", held_out) if split is not None]
     return make_scene(
         path,

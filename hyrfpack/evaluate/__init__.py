@@ -124,7 +124,9 @@ def evaluate_model(
     for view in views if isinstance(views, Sequence) else [views]:
         check_type("each of the views", view, View)
     if not views:
-        raise HyrfError("there is no view to score", fix="name a split that has photos or a smaller `test_every`")
+        raise HyrfError(
+            "there is no view to score", fix="name a split that has photos, or hold some out with `test_every`"
+        )
     perceptual = None if lpips_weights is None else LPIPS.load(lpips_weights)
     pictures_to_write = picture_names(views, picture_count)
 

@@ -15,8 +15,8 @@ from hyrfpack.model.merged import MergedModel
 from hyrfpack.progress import Progress, ignore_progress, part_of_progress
 from hyrfpack.scene import Camera, evenly_spaced
 
-# Every ninth camera, from the fifth on, is a validation camera. `Source` makes up cameras at three heights in turn, of
-# which this slice takes the middle one.
+# Every ninth camera, from the fifth on, is a validation camera. Generated cameras stand at three heights
+# in turn, of which this slice takes the middle one.
 VALIDATION_CAMERAS = slice(4, None, 9)
 MAX_GAUSSIANS = 200_000
 # A lower degree takes fewer bytes, so it may score this much less than the best one.

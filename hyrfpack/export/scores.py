@@ -79,8 +79,8 @@ def _warn_of_cost(cost: float, loaded: Source, kind: FileKind) -> None:
         return
     where = "" if loaded.cameras else " at generated viewpoints (name photos with `data` for a measurement at theirs)"
     _LOG.warning(
-        f"{kind.ending} costs {cost:.1f} dB{where}: it is too coarse for this scene, perhaps for its unit of length; "
-        "choose another format"
+        f"{kind.ending} costs {cost:.1f} dB{where}, because its numbers are too coarse for this scene; choose another "
+        "format, or scale the scene"
     )
 
 

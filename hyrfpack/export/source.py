@@ -41,7 +41,7 @@ class Source:
         drawn: what is shown and exported: `model`, or all parts of a merged file.
         cameras: names and cameras of the training photos; empty if the file keeps none and no photos are given. Files
             keep no names, so without photos these are "camera-0000.png" and so on.
-        fit_cameras: cameras at which colours are fitted; made-up ones around the scene if none are known.
+        fit_cameras: cameras at which colours are fitted; generated ones around the scene if none are known.
         measured_views: cameras at which the loss is measured, with their photos or None. They are not fitted, unless
             the file keeps fewer than MIN_CAMERAS_TO_HOLD_OUT cameras, or MIN_COARSE_CAMERAS_TO_HOLD_OUT coarse ones.
         up: (3,) unit vector that points up in the scene.

@@ -64,7 +64,7 @@ def test_the_val_split_replaces_a_missing_test_split(tmp_path, opengl_frames):
     scene = load_scene(tmp_path)
 
     assert [view.name for view in scene.test] == ["val/r_0.png", "val/r_1.png", "val/r_2.png"]
-    assert any("val is used" in note for note in scene.notes)
+    assert any("transforms_val.json are held out" in note for note in scene.notes)
     tables = [f"transforms_{split}.json" for split in ("train", "val")]
     photos = [f"{split}/r_{index}.png" for split in ("train", "val") for index in range(3)]
     assert sorted(scene.files) == sorted(str(tmp_path / name) for name in tables + photos)

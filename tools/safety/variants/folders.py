@@ -72,7 +72,7 @@ def variants() -> Iterator[Variant]:
     )
     for depth in ("set", "a/set", "a/b/set"):
         yield Variant(
-            f"folders: all of it in {depth}", lambda s, d=depth: _nest_set(s, d), layouts=ALL_LAYOUTS, note="is used"
+            f"folders: all of it in {depth}", lambda s, d=depth: _nest_set(s, d), layouts=ALL_LAYOUTS, note="are used"
         )
     yield Variant("folders: four deep", lambda s: _nest_set(s, "a/b/c/set"), "no poses found", layouts=ALL_LAYOUTS)
     yield Variant(
