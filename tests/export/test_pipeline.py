@@ -346,7 +346,7 @@ def test_a_format_too_coarse_for_the_unit_of_length_is_reported(unit, view_sourc
     export_in_unit(unit, view_source, tmp_path)
     message = caplog.messages[-1]
     assert caplog.records[-1].levelname == "WARNING"
-    pattern = r"\.spz costs \d+\.\d dB[^\n]*, because its numbers are too coarse[^\n]*another format, or scale the scene"
+    pattern = r"\.spz costs \d+\.\d dB[^\n]*, because its numbers are too coarse[^\n]*, or scale the scene"
     assert re.fullmatch(pattern, message)
     assert ("`data`" in message) == (view_source == "generated viewpoints")
 
