@@ -19,6 +19,7 @@ from hyrfpack.poses.owned_files import (
     OWNED_FOLDERS,
     REPORT_NAME,
     OwnedFiles,
+    find_foreign_model_file,
     has_only,
     list_files,
     read_report,
@@ -63,7 +64,8 @@ class SceneOutput:
         """
         names = set(os.listdir(self.scene))
         if names.intersection((*COLMAP_MODEL_FOLDERS, *COLMAP_TABLE_NAMES, *POSE_FILE_NAMES, "colmap")):
-            if read_report(self.scene) is None:
+            report = read_report(self.scene)
+            if report is None:
                 raise HyrfError(
                     f"{self.scene}: the folder has poses of another program, which are kept",
                     fix="train on them, or name another folder",
@@ -72,6 +74,11 @@ class SceneOutput:
                 raise HyrfError(
                     f"{self.scene}: the folder has poses already",
                     fix="use them, or replace them with `overwrite=True`",
+                )
+            if (foreign := find_foreign_model_file(self.scene, report)) is not None:
+                raise HyrfError(
+                    f"{self.scene / foreign}: this file would be removed, and no estimation of poses wrote it",
+                    fix="move it elsewhere, or name another folder",
                 )
         if not is_same_path(photos, self.scene) and any(name.lower().endswith(PICTURE_SUFFIXES) for name in names):
             raise HyrfError(f"{self.scene}: photos lie in this folder", fix="name another for the scene")
@@ -150,6 +157,7 @@ class SceneOutput:
             model: folder of the COLMAP model.
             report: content of the report, without the list of owned files.
         """
+        report = {**report, "model_files": list_files(model, "sparse/0")}
         old_files = self.owned_files()
         new_files: OwnedFiles = {}
         in_progress = [name for name in OWNED_FOLDERS if (self.work / name).is_dir()]

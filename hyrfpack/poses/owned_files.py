@@ -12,6 +12,10 @@ from typing import Any
 OWNED_FOLDERS = ("images", "masks")  # an estimation writes photos and masks into these folders of a scene
 REPORT_NAME = "poses.json"
 
+# The files of the COLMAP model, which reports of earlier versions do not list.
+MODEL_FILES = frozenset(f"sparse/0/{table}.bin" for table in ("cameras", "frames", "images", "points3D", "rigs"))
+IGNORED_NAMES = frozenset((".DS_Store", "Thumbs.db", "desktop.ini"))  # File managers write these into any folder.
+
 OwnedFiles = dict[str, int]  # size in bytes of each file, by its path relative to the scene
 
 
@@ -45,6 +49,16 @@ def unchanged_files(scene: Path, owned: Any) -> OwnedFiles:
             if inside and path.is_file() and path.stat().st_size == size:
                 found[name] = size
     return found
+
+
+def find_foreign_model_file(scene: Path, report: dict[str, Any]) -> str | None:
+    """Return the name of a file below `sparse` that the estimation of a report did not write; None if there is none."""
+    recorded = report.get("model_files")
+    for name, size in sorted(list_files(scene / "sparse", "sparse").items()):
+        is_own = recorded.get(name) == size if isinstance(recorded, dict) else name in MODEL_FILES
+        if not is_own and Path(name).name not in IGNORED_NAMES:
+            return name
+    return None
 
 
 def remove_files(scene: Path, owned: OwnedFiles, keep: Collection[Path]) -> None:

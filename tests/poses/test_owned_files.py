@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 from contextlib import suppress
@@ -202,6 +203,34 @@ def test_poses_that_another_program_writes_meanwhile_are_kept_and_so_is_the_work
     caplog.clear()
     estimate_with_fake_stages(tmp_path / "photos", scene)
     assert caplog.messages[0] == "resuming an interrupted estimation" and (scene / "sparse" / "0").is_dir()
+
+
+@pytest.mark.parametrize("name", ["sparse/1/cameras.bin", "sparse/0/points3D.ply"])
+@pytest.mark.parametrize("has_list", [True, False], ids=["", "report of an earlier version"])
+def test_files_beside_the_model_are_never_removed(name, has_list, tmp_path):
+    scene, photos = tmp_path / "scene", write_photos(tmp_path / "photos")
+    estimate_with_fake_stages(photos, scene)
+    if not has_list:
+        report = json.loads((scene / "poses.json").read_text())
+        assert report.pop("model_files") == {}  # The fake model has no files.
+        (scene / "poses.json").write_text(json.dumps(report))
+    (scene / "sparse" / ".DS_Store").write_bytes(b"of the file manager")
+    (scene / name).parent.mkdir(exist_ok=True)
+    (scene / name).write_bytes(b"mine")
+    with pytest.raises(hyrfpack.HyrfError, match=f"{name}: this file would be removed, and no estimation"):
+        estimate_with_fake_stages(photos, scene, overwrite=True)
+    assert (scene / name).read_bytes() == b"mine"
+    (scene / name).unlink()
+    estimate_with_fake_stages(photos, scene, overwrite=True)
+
+
+def test_a_model_that_was_replaced_is_kept(tmp_path):
+    scene, photos = tmp_path / "scene", write_photos(tmp_path / "photos")
+    estimate_with_fake_stages(photos, scene)
+    (scene / "sparse" / "0" / "cameras.bin").write_bytes(b"of another program")
+    with pytest.raises(hyrfpack.HyrfError, match=r"cameras\.bin: this file would be removed"):
+        estimate_with_fake_stages(photos, scene, overwrite=True)
+    assert (scene / "sparse" / "0" / "cameras.bin").read_bytes() == b"of another program"
 
 
 def test_leftover_masks_are_not_used_in_place_of_the_given_ones(tmp_path):
