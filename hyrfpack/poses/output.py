@@ -156,12 +156,16 @@ class SceneOutput:
         Args:
             model: folder of the COLMAP model.
             report: content of the report, without the list of owned files.
+
+        Raises:
+            HyrfError: a folder that would be replaced has files of other origin by now.
         """
         report = {**report, "model_files": list_files(model, "sparse/0")}
         old_files = self.owned_files()
         new_files: OwnedFiles = {}
         in_progress = [name for name in OWNED_FOLDERS if (self.work / name).is_dir()]
         for name in in_progress:
+            self.check_free(name)  # again, because nothing may be removed unless all of it can be replaced
             new_files |= list_files(self.work / name, name)
         replaced, unfinished = self.work / "replaced", self.work / "sparse"
         for folder in (replaced, unfinished):

@@ -62,7 +62,10 @@ def find_foreign_model_file(scene: Path, report: dict[str, Any]) -> str | None:
 
 
 def remove_files(scene: Path, owned: OwnedFiles, keep: Collection[Path]) -> None:
-    """Remove owned files, except those in `keep` (resolved paths), and the folders that become empty."""
+    """Remove owned files, except those in `keep` (resolved paths), and the folders that become empty.
+
+    A folder with nothing but files of IGNORED_NAMES counts as empty.
+    """
     root = scene.resolve()
     for name in owned:
         if root / name not in keep:
@@ -70,14 +73,17 @@ def remove_files(scene: Path, owned: OwnedFiles, keep: Collection[Path]) -> None
     for parent in sorted({parent for name in owned for parent in (scene / name).parents}, reverse=True):
         if parent != scene and scene in parent.parents:
             with suppress(OSError):  # a folder with other files stays
+                if IGNORED_NAMES.issuperset(os.listdir(parent)):
+                    for ignored in os.listdir(parent):
+                        (parent / ignored).unlink()
                 os.rmdir(parent)
 
 
 def has_only(scene: Path, name: str, owned: OwnedFiles) -> bool:
-    """Return whether a folder of the scene is not a link and would be empty after its owned files are removed."""
+    """Return whether a folder of the scene is no link, and `remove_files` of the owned files would empty it."""
     folder = scene / name
     if folder.is_symlink() or not folder.is_dir():
         return False
     expected = {scene / file for file in owned}
     expected |= {parent for file in expected for parent in file.parents}
-    return expected.issuperset(folder.rglob("*"))
+    return all(path in expected or path.name in IGNORED_NAMES for path in folder.rglob("*"))

@@ -233,6 +233,29 @@ def test_a_model_that_was_replaced_is_kept(tmp_path):
     assert (scene / "sparse" / "0" / "cameras.bin").read_bytes() == b"of another program"
 
 
+@pytest.mark.parametrize("name", [".DS_Store", "Thumbs.db"])
+def test_files_of_file_managers_do_not_stand_in_the_way(name, tmp_path):
+    scene = tmp_path / "scene"
+    estimate_with_fake_stages(write_photos(tmp_path / "photos"), scene)
+    (scene / "images" / name).write_bytes(b"of the file manager")
+    estimate_with_fake_stages(write_photos(tmp_path / "others", seed=1), scene, overwrite=True)
+    assert (scene / "sparse" / "0").is_dir() and same_bytes(scene / "images" / "0.png", tmp_path / "others" / "0.png")
+
+
+def test_a_file_that_appears_during_the_estimation_leaves_old_photos_and_poses(tmp_path):
+    scene = tmp_path / "scene"
+    estimate_with_fake_stages(write_photos(tmp_path / "photos"), scene)
+
+    def appear(event: TaskEvent) -> None:
+        (scene / "images" / "mine.txt").write_text("mine")
+
+    with pytest.raises(hyrfpack.HyrfError, match="images: the folder holds files that do not belong"):
+        estimate_with_fake_stages(
+            write_photos(tmp_path / "others", seed=1), scene, overwrite=True, context=RunContext(progress=appear)
+        )
+    assert (scene / "sparse" / "0").is_dir() and same_bytes(scene / "images" / "0.png", tmp_path / "photos" / "0.png")
+
+
 def test_leftover_masks_are_not_used_in_place_of_the_given_ones(tmp_path):
     write_photos(tmp_path / "photos")
     for folder, level in (("named", 255), ("scene/masks", 0)):
