@@ -132,8 +132,11 @@ def train(
     torch_device = choose_command_device(device, ranks)
 
     def is_resumable(run: Path) -> bool:
-        # "auto" may choose a single block, which is trained as a run without blocks.
-        return is_begun(run) or is_block_run_begun(run)
+        if blocks is None:
+            return is_begun(run)
+        # A single block, which "auto" may choose, is trained as a run without blocks.
+        is_single = blocks == "auto" or parse_grid(blocks) == (1, 1)
+        return is_block_run_begun(run) or (is_single and is_begun(run))
 
     try:
         scene = ranks.run_on_all(lambda: read_scene(data, reader_options))

@@ -27,7 +27,7 @@ def read_blender(path: Path, *, test_every: int, max_size: int) -> Scene:
     held_out = next((split for split in ("test", "val") if (path / f"transforms_{split}.json").is_file()), None)
     test_names = None
     if held_out is None:
-        notes.append("there is no transforms_test.json or transforms_val.json, so held-out photos are chosen by number")
+        notes.append("there is no transforms_test.json or transforms_val.json")
     else:
         test = _read_split(path, held_out, notes)
         test_names = {photo.name for photo in test}

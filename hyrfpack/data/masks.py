@@ -79,20 +79,22 @@ def find_masks(
     return MaskMatches({}, _unmatched_mask_notes(folder, unmatched, len(index.files), names))
 
 
-def assign_masks(views: Sequence[View], folder: Path) -> list[View]:
+def assign_masks(views: Sequence[View], folder: Path, others: Sequence[View] = ()) -> list[View]:
     """Return the views for whose photos a folder has masks, with these masks instead of any others.
 
     Args:
         views: views of photos on disk.
-        folder: the folder of masks, which are found by name as by `find_masks`. Masks that match no photo are logged.
+        folder: the folder of masks, which are found by name as by `find_masks`. Masks that match no photo, also none of
+            `others`, are logged.
+        others: views of photos whose masks are not used.
 
     Raises:
         HyrfDataError: the folder has no mask of these photos, or a mask has another aspect ratio than its photo.
     """
     loaders = {view.name: view.load for view in views if isinstance(view.load, PhotoFile | FaceFile)}
-    sizes = [(name, load.stored) for name, load in loaders.items()]
+    sizes = [(view.name, view.load.stored) for view in (*views, *others) if isinstance(view.load, PhotoFile | FaceFile)]
     found = find_masks(folder, sizes, set(), allow_shared=False) if folder.is_dir() else MaskMatches()
-    if not found.by_photo:
+    if loaders.keys().isdisjoint(found.by_photo):
         example = f", such as {Path(views[0].name).stem}.png" if views else ""
         raise HyrfDataError(
             f"{folder}: {'no mask has the name of a photo' if folder.is_dir() else 'there is no such folder'}",

@@ -97,7 +97,7 @@ def _(action: CropMasks, state: EditState) -> np.ndarray:
             "masks of photos select Gaussians of one model, and this file holds several",
             fix="take a part out with `part`, crop it, and merge again",
         )
-    views = assign_masks(state.photos, Path(action.folder))
+    views = assign_masks(state.photos, Path(action.folder), state.held_out)
     return share_of_light_in_masks(state.model, views, state.progress) >= action.min_light_share
 
 

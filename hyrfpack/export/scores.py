@@ -77,7 +77,7 @@ def _warn_of_cost(cost: float, loaded: Source, kind: FileKind) -> None:
             f"choose {able}"
         )
         return
-    where = "" if loaded.cameras else " at generated viewpoints (name photos with `data` for a measurement at theirs)"
+    where = "" if loaded.cameras else " at generated viewpoints"
     _LOG.warning(
         f"{kind.ending} costs {cost:.1f} dB{where}, because its numbers are too coarse for this scene; choose another "
         "format, or scale the scene"

@@ -22,7 +22,7 @@ _TRAINED_FILE = "preview.raw.hyrf"  # the model before it is compressed
 
 
 def remove_preview(stage_cache: StageCache) -> None:
-    """Remove the preview of an earlier call once the training is finished."""
+    """Remove the preview of an earlier call, if there is one."""
     with suppress(OSError):
         (stage_cache.folder / PREVIEW_FILE).unlink(missing_ok=True)
 

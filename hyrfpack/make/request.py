@@ -107,8 +107,8 @@ class Request:
             given += ["observer"] if self.observer is not None else []
             if given:
                 raise HyrfError(
-                    f"{source.path}: this is no set of photos, and a setting was given that applies to photos only",
-                    fix=f"leave out `{given[0]}`",
+                    f"{source.path}: this is no set of photos, but settings for photos were given",
+                    fix="leave out " + " and ".join(f"`{name}`" for name in given),
                 )
         if source.kind == "model":
             for name in ("quality", "seed"):

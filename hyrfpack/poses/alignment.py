@@ -124,9 +124,10 @@ def align_poses(a: Poses, b: Poses) -> PoseAlignment:
 def _sample_camera_pairs(count: int) -> np.ndarray:
     """Return all pairs of cameras, or a random sample if there are too many: (pairs, 2)."""
     pairs = count * (count - 1) // 2
-    chosen = np.arange(pairs)
     if pairs > _MAX_CANDIDATE_PAIRS:
         chosen = np.random.default_rng(0).choice(pairs, _MAX_CANDIDATE_PAIRS, replace=False)
+    else:
+        chosen = np.arange(pairs)
     # Pairs are numbered (0, 1), (0, 2), ... (1, 2), ...; camera i is the first of count - 1 - i pairs.
     firsts = np.arange(count)
     starts = firsts * (2 * count - firsts - 1) // 2

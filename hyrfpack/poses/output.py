@@ -23,6 +23,7 @@ from hyrfpack.poses.owned_files import (
     has_only,
     list_files,
     read_report,
+    remove_empty_folder,
     remove_files,
     unchanged_files,
 )
@@ -175,8 +176,7 @@ class SceneOutput:
         self._write_report(report, old_files | new_files)
         remove_files(self.scene, old_files, self.protected)
         for name in in_progress:
-            if (self.scene / name).is_dir():
-                (self.scene / name).rmdir()
+            remove_empty_folder(self.scene / name)
             os.replace(self.work / name, self.scene / name)
         self._write_report(report, self.owned_files())
         unfinished.mkdir()

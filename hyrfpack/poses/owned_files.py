@@ -72,11 +72,17 @@ def remove_files(scene: Path, owned: OwnedFiles, keep: Collection[Path]) -> None
             (scene / name).unlink(missing_ok=True)
     for parent in sorted({parent for name in owned for parent in (scene / name).parents}, reverse=True):
         if parent != scene and scene in parent.parents:
-            with suppress(OSError):  # a folder with other files stays
-                if IGNORED_NAMES.issuperset(os.listdir(parent)):
-                    for ignored in os.listdir(parent):
-                        (parent / ignored).unlink()
-                os.rmdir(parent)
+            remove_empty_folder(parent)
+
+
+def remove_empty_folder(folder: Path) -> None:
+    """Remove a folder that has at most files of IGNORED_NAMES; any other stays."""
+    with suppress(OSError):
+        names = os.listdir(folder)
+        if IGNORED_NAMES.issuperset(names):
+            for name in names:
+                (folder / name).unlink()
+            os.rmdir(folder)
 
 
 def has_only(scene: Path, name: str, owned: OwnedFiles) -> bool:

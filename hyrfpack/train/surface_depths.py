@@ -64,10 +64,11 @@ def find_surface_depths(scene: Scene, cache: PictureCache) -> list[SurfaceDepths
     Raises:
         HyrfDataError: a photo cannot be read.
     """
-    return cache.derive(_find, scene)
+    return cache.derive(_compute_surface_depths, scene)
 
 
-def _find(scene: Scene, cache: PictureCache) -> list[SurfaceDepths]:
+def _compute_surface_depths(scene: Scene, cache: PictureCache) -> list[SurfaceDepths]:
+    """Compute what `find_surface_depths` returns."""
     if not scene.tracks and len(scene.points) > MAX_GUIDING_POINTS:
         chosen = np.random.default_rng(0).choice(len(scene.points), MAX_GUIDING_POINTS, replace=False)
         scene = replace(scene, points=scene.points[chosen], point_colors=scene.point_colors[chosen])

@@ -23,7 +23,8 @@ def draw_surface_points(
 
     Args:
         scene: a scene with points.
-        cache: cache of decoded photos. Those from which points are drawn are read twice unless it keeps them.
+        cache: cache of decoded photos. At most MAX_PHOTOS are read: for the depths, unless it keeps these, and for the
+            colours.
         count: number of points.
         generator: source of the random pixels.
 

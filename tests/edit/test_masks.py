@@ -134,8 +134,12 @@ def test_a_single_mask_does_not_apply_to_all_photos(photos, tmp_path):
     )
 
 
-def test_masks_of_no_photo_are_reported(photos, masks, tmp_path):
+def test_only_masks_of_no_photo_are_reported(photos, masks, scene, tmp_path):
     shutil.copytree(masks, tmp_path / "masks")
+    for view in scene.test:
+        Image.new("L", (48, 48), 255).save(tmp_path / "masks" / f"{Path(view.name).stem}.png")
+    result = succeeded("edit", DEMO_MODEL_FILE, "--plan", "--crop-masks", tmp_path / "masks", "--data", photos)
+    assert "no photo" not in result.stderr
     Image.new("L", (48, 48), 255).save(tmp_path / "masks" / "other.png")
     result = succeeded("edit", DEMO_MODEL_FILE, "--plan", "--crop-masks", tmp_path / "masks", "--data", photos)
     assert "masks matches no photo of the scene (such as other.png)" in result.stderr

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from made_up_poses import circle_poses, line_poses, transform_poses
@@ -10,12 +12,16 @@ from scipy.spatial.transform import Rotation
 from hyrfpack.poses.alignment import _sample_camera_pairs, align_poses, camera_extent, camera_positions
 
 
-@pytest.mark.parametrize("count", [2, 3, 50, 90, 91, 700])
+@pytest.mark.parametrize("count", [2, 3, 50, 90, 91, 700, 20_000])
 def test_compared_pairs_are_all_or_a_sample_without_repetitions(count):
+    tracemalloc.start()
     pairs = _sample_camera_pairs(count)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
     everything = count * (count - 1) // 2
     assert len(pairs) == min(everything, 4000) == len(set(map(tuple, pairs.tolist())))
     assert (pairs[:, 0] < pairs[:, 1]).all() and pairs.min() >= 0 and pairs.max() < count
+    assert peak < 5_000_000  # bytes
 
 
 @pytest.mark.parametrize("poses", [circle_poses(), line_poses()])

@@ -40,11 +40,14 @@ def prepare_photos(source: Path, scene: Path, **settings) -> None:
         hyrfpack.estimate_poses(source, scene, **settings)
 
 
-def estimate_with_fake_stages(source: Path, scene: Path, **settings) -> None:
-    """Estimate poses with fake results of the stages and an empty model."""
+def estimate_with_fake_stages(source: Path, scene: Path, at_end=lambda: None, **settings) -> None:
+    """Estimate poses with fake results of the stages and a fake model; `at_end` is called in the last stage."""
 
     def answer(job: Path, stage: str, *more) -> dict:
         (job.parent / "chosen").mkdir(exist_ok=True)
+        (job.parent / "chosen" / "cameras.bin").write_bytes(b"cameras")
+        if stage == "finish":
+            at_end()
         names = Job.load(job).names
         return {
             "features": {"keypoints": dict.fromkeys(names, 99), "sharpness": dict.fromkeys(names, 1), "unreadable": {}},
@@ -212,7 +215,7 @@ def test_files_beside_the_model_are_never_removed(name, has_list, tmp_path):
     estimate_with_fake_stages(photos, scene)
     if not has_list:
         report = json.loads((scene / "poses.json").read_text())
-        assert report.pop("model_files") == {}  # The fake model has no files.
+        assert report.pop("model_files") == {"sparse/0/cameras.bin": 7}
         (scene / "poses.json").write_text(json.dumps(report))
     (scene / "sparse" / ".DS_Store").write_bytes(b"of the file manager")
     (scene / name).parent.mkdir(exist_ok=True)
@@ -227,6 +230,7 @@ def test_files_beside_the_model_are_never_removed(name, has_list, tmp_path):
 def test_a_model_that_was_replaced_is_kept(tmp_path):
     scene, photos = tmp_path / "scene", write_photos(tmp_path / "photos")
     estimate_with_fake_stages(photos, scene)
+    estimate_with_fake_stages(photos, scene, overwrite=True)
     (scene / "sparse" / "0" / "cameras.bin").write_bytes(b"of another program")
     with pytest.raises(hyrfpack.HyrfError, match=r"cameras\.bin: this file would be removed"):
         estimate_with_fake_stages(photos, scene, overwrite=True)
@@ -242,17 +246,24 @@ def test_files_of_file_managers_do_not_stand_in_the_way(name, tmp_path):
     assert (scene / "sparse" / "0").is_dir() and same_bytes(scene / "images" / "0.png", tmp_path / "others" / "0.png")
 
 
+def test_a_folder_with_nothing_but_files_of_file_managers_counts_as_empty(tmp_path):
+    scene = tmp_path / "scene"
+    (scene / "images").mkdir(parents=True)
+    (scene / "images" / ".DS_Store").write_bytes(b"of the file manager")
+    estimate_with_fake_stages(write_photos(tmp_path / "photos"), scene)
+    assert png_names(scene / "images") == png_names(tmp_path / "photos")
+
+
 def test_a_file_that_appears_during_the_estimation_leaves_old_photos_and_poses(tmp_path):
     scene = tmp_path / "scene"
     estimate_with_fake_stages(write_photos(tmp_path / "photos"), scene)
 
-    def appear(event: TaskEvent) -> None:
+    def appear() -> None:
+        assert (scene / ".poses" / "images").is_dir()
         (scene / "images" / "mine.txt").write_text("mine")
 
     with pytest.raises(hyrfpack.HyrfError, match="images: the folder holds files that do not belong"):
-        estimate_with_fake_stages(
-            write_photos(tmp_path / "others", seed=1), scene, overwrite=True, context=RunContext(progress=appear)
-        )
+        estimate_with_fake_stages(write_photos(tmp_path / "others", seed=1), scene, appear, overwrite=True)
     assert (scene / "sparse" / "0").is_dir() and same_bytes(scene / "images" / "0.png", tmp_path / "photos" / "0.png")
 
 
