@@ -151,7 +151,7 @@ def _combine(costs, combined):
     """Write the mean cost of the better half of the photos that show a pixel's point to combined (H, W).
 
     Args:
-        costs: (S, H, W) float32, `UNSEEN_COST` where a photo does not show the point. It is overwritten.
+        costs: (S, H, W) float32, `UNSEEN_COST` where a photo does not show the point.
         combined: (H, W) float32, 1 where no photo does.
     """
     count, height, width = costs.shape
