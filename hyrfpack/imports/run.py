@@ -196,12 +196,7 @@ def import_loaded_splats(
     if config.target_bytes is None and _falls_short(reached_psnr, config.target_psnr):
         _LOG.warning(_shortfall(reached_psnr, unpacked_psnr, config, has_cameras=cameras is not None))
     if config.worst is not None and _falls_short(min(scores), config.worst):
-        is_reachable = not _falls_short(min(unpacked_scores), config.worst)
-        advice = "set a higher `worst`" if is_reachable else "so does the model before compression; set a lower `worst`"
-        _LOG.warning(
-            f"the target PSNR of the worst view is {config.worst:g} dB, but the worst held-out view has "
-            f"{min(scores):.1f} dB; {advice}"
-        )
+        _LOG.warning(_worst_shortfall(min(scores), min(unpacked_scores), config.worst))
     return ImportReport(
         gaussians_before=len(splats),
         gaussians_after=len(decoded),
@@ -248,3 +243,12 @@ def _shortfall(reached_psnr: float, unpacked_psnr: float, config: ImportConfig, 
             "limited in a model, so give more `cameras` or set a lower `psnr`"
         )
     return f"{outcome}; opacities and scales are limited in a model, so set a lower `psnr`"
+
+
+def _worst_shortfall(reached_psnr: float, unpacked_psnr: float, asked: float) -> str:
+    """Describe how far the worst held-out view falls short of the PSNR asked for, and what the user can do about it."""
+    remedy = "lower" if _falls_short(unpacked_psnr, asked) else "higher"
+    return (
+        f"the target PSNR of the worst view is {asked:g} dB, but the worst held-out view has {reached_psnr:.1f} dB "
+        f"({unpacked_psnr:.1f} dB before compression); set a {remedy} `worst`"
+    )

@@ -222,6 +222,8 @@ def test_a_missed_target_advises_another_psnr() -> None:
     messages = run._shortfall(36.5, 38.6, ImportConfig(psnr=37), has_cameras=False)
     assert "reaches 36.5" in messages and messages.endswith("set a higher target with `psnr`")
     assert "set a lower `psnr`" in run._shortfall(55, 56, ImportConfig(psnr=60), has_cameras=False)
+    assert "(34.1 dB before compression); set a higher `worst`" in run._worst_shortfall(31.2, 34.1, 33)
+    assert "(32.5 dB before compression); set a lower `worst`" in run._worst_shortfall(31.2, 32.5, 33)
     assert not run._falls_short(36.96, 37) and run._falls_short(36.94, 37)
     assert not run._falls_short(37.04, 37.04)
 
