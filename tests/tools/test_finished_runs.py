@@ -22,6 +22,15 @@ def test_files_beside_the_folders_of_runs_are_ignored(tmp_path):
     assert [name for name, _, _ in load_runs(tmp_path / "runs", tmp_path / "data")] == ["demo"]
 
 
+def test_a_set_with_runs_of_two_versions_is_refused(tmp_path):
+    for version in ("before", "now"):
+        folder = tmp_path / "runs" / "demo" / f"{version}-measured-0"
+        folder.mkdir(parents=True)
+        (folder / "model.hyrf").touch()
+    with pytest.raises(ValueError, match="demo/before-measured-0, demo/now-measured-0"):
+        list(load_runs(tmp_path / "runs", tmp_path / "data"))
+
+
 @pytest.mark.parametrize(
     ("change", "is_same"),
     [({}, True), ({"steps": 9}, False), ({"seed": 1}, False), ({"exposure": True}, False), ({"exposure": None}, True)],

@@ -1,11 +1,11 @@
 """Crop trained models to their subject, and measure bytes and the quality of the subject before and after.
 
-    python -m tools.studies.crop_subject --runs runs/quality/2000 --crops mipnerf360_bonsai=0.35 ngp_fox=0.3
+    python -m tools.studies.crop_subject --runs runs/sets/2000 --crops mipnerf360_bonsai=0.35 ngp_fox=0.3
 
---runs has a folder for each data set, and below it runs with a `model.hyrf`. The subject is what lies in a sphere about
-the point that the cameras look at; its radius is given as a share of the median distance from the cameras to that
-point. The model and the cropped model are both compressed. PSNR in dB and SSIM are those of the files on held-out
-photos, over the pixels whose surface lies in the sphere; the model before the crop decides which pixels these are.
+--runs has a folder for each data set, with one run: a `model.hyrf`. The subject is what lies in a sphere about the
+point that the cameras look at; its radius is given as a share of the median distance from the cameras to that point.
+The model and the cropped model are both compressed. PSNR in dB and SSIM are those of the files on held-out photos, over
+the pixels whose surface lies in the sphere; the model before the crop decides which pixels these are.
 """
 
 from __future__ import annotations

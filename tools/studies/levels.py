@@ -1,13 +1,13 @@
 """Split trained models into chunks with levels of detail, and compare predicted with measured errors of views.
 
-    python -m tools.studies.levels --runs runs/quality/2000 --sets mipnerf360_bonsai kitti_street indoor_room
+    python -m tools.studies.levels --runs runs/sets/2000 --sets mipnerf360_bonsai kitti_street indoor_room
 
---runs has a folder for each data set, and below it runs with a `model.hyrf` and, beside it, its `compact.hyrf`, which
-is split. The first table compares the finest level with the file: bytes, PSNR in dB of its renders against those of the
-file, and PSNR of both on held-out photos. The second one draws views between the cameras, which levels were neither
-fitted nor measured at, within budgets: the share of all Gaussians, the size of the pictures, the mean Gaussians in a
-view, predicted and measured PSNR against the finest level, the largest difference of both in one view, and the PSNR of
-the level of about as many Gaussians everywhere.
+--runs has a folder for each data set, with one run: a `model.hyrf` and, beside it, its `compact.hyrf`, which is split.
+The first table compares the finest level with the file: bytes, PSNR in dB of its renders against those of the file, and
+PSNR of both on held-out photos. The second one draws views between the cameras, which levels were neither fitted nor
+measured at, within budgets: the share of all Gaussians, the size of the pictures, the mean Gaussians in a view,
+predicted and measured PSNR against the finest level, the largest difference of both in one view, and the PSNR of the
+level of about as many Gaussians everywhere.
 """
 
 from __future__ import annotations

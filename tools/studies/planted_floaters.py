@@ -1,9 +1,9 @@
 """Measure how well `hyrfpack edit --remove-floaters` finds floaters that this program plants in trained models.
 
-    python -m tools.studies.planted_floaters --runs runs/quality/2000 --shares 0.05 0.15
+    python -m tools.studies.planted_floaters --runs runs/sets/2000 --shares 0.05 0.15
 
---runs has a folder for each data set, and below it runs with a `model.hyrf`. A share of the model's number of Gaussians
-is planted, half of them near cameras (at 8 to 30 % of the median depth of a view), half in free space (at 30 to 80 % of
+--runs has a folder for each data set, with one run: a `model.hyrf`. A share of the model's number of Gaussians is
+planted, half of them near cameras (at 8 to 30 % of the median depth of a view), half in free space (at 30 to 80 % of
 the depth at a pixel). Colours are random; scales and opacities are those of other Gaussians, changed by the fields at
 the new place. Only those with an opacity above 0.2 and a scale that is usual in the model are planted.
 

@@ -1,11 +1,11 @@
 """Measure how well `hyrfpack edit --refit` repairs damage that this program plants in a part of trained models.
 
-    python -m tools.studies.refit --runs runs/quality/2000 --sets ngp_fox --steps 200 500 --factors 0.1 0.3 1
+    python -m tools.studies.refit --runs runs/sets/2000 --sets ngp_fox --steps 200 500 --factors 0.1 0.3 1
 
---runs has a folder for each data set, and below it runs with a `model.hyrf`. The region is the sphere around the point
-that the cameras look at with a tenth of the Gaussians. Damage "colors" shuffles the colours of its Gaussians, "all"
-also their scales and opacities, "moved" moves their centres at random by a twentieth of the sphere's radius, and "none"
-changes nothing.
+--runs has a folder for each data set, with one run: a `model.hyrf`. The region is the sphere around the point that the
+cameras look at with a tenth of the Gaussians. Damage "colors" shuffles the colours of its Gaussians, "all" also their
+scales and opacities, "moved" moves their centres at random by a twentieth of the sphere's radius, and "none" changes
+nothing.
 
 The columns are PSNR in dB of the region, on pixels that mostly show it: of the model, with the damage, and after the
 refit. Without --held-out, every eighth training photo is a validation photo, which the refit

@@ -21,7 +21,7 @@ def make_runs_parser(text: str) -> argparse.ArgumentParser:
 
 
 def load_runs(runs: Path, data: Path, names: Sequence[str] | None = None) -> Iterator[tuple[str, Path, Scene]]:
-    """Yield the name of each data set, the model file of its first run, and its scene.
+    """Yield the name of each data set, the model file of its run, and its scene.
 
     Args:
         runs: folder of the data sets' runs.
@@ -30,9 +30,13 @@ def load_runs(runs: Path, data: Path, names: Sequence[str] | None = None) -> Ite
 
     Raises:
         FileNotFoundError: a data set has no run.
+        ValueError: a data set has several runs, such as those of two versions.
     """
     for name in names or sorted(path.name for path in runs.iterdir() if path.is_dir()):
         model_files = sorted((runs / name).glob(f"**/{MODEL_FILE}"))
         if not model_files:
             raise FileNotFoundError(f"{runs / name}: no run with a {MODEL_FILE}")
+        if len(model_files) > 1:
+            folders = ", ".join(str(path.parent.relative_to(runs)) for path in model_files)
+            raise ValueError(f"{runs}: several runs of {name}: {folders}; give a folder with one run for each data set")
         yield name, model_files[0], hyrfpack.load_scene(data / name)
