@@ -14,7 +14,7 @@ from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.optimizer import Optimizer
-from tools.studies.design_choices import CHOICES_BY_VARIANT, train_models_with
+from tools.studies.design_choices import CHOICES_BY_VARIANT, run_folder, train_models_with
 
 
 def point_sizes(points: np.ndarray) -> np.ndarray:
@@ -51,6 +51,12 @@ def test_children_of_the_product_rule_are_decoded_as_their_parent_over_1_6(scale
         children = model.decode_geometry().scales
     assert len(model) == 40
     torch.testing.assert_close(children, parents.repeat(2, 1) / 1.6, rtol=1e-4, atol=0)
+
+
+def test_each_variant_keeps_its_own_runs_wherever_it_stands_in_the_table(tmp_path) -> None:
+    folders = {variant: run_folder(tmp_path, variant, "demo", 0).name for variant in CHOICES_BY_VARIANT}
+    assert len(set(folders.values())) == len(CHOICES_BY_VARIANT)
+    assert folders["no background sphere"] == "no-background-sphere-demo-0"
 
 
 @pytest.mark.parametrize("name", [name for name, choice in CHOICES_BY_VARIANT.items() if choice.model])

@@ -1,14 +1,17 @@
 """Run the ablation behind each default for which the HyRF paper and its authors' code disagree.
 
-    python -m tools.studies.design_choices --steps 2000        prints the table of docs/research/paper-and-code.md
+    python -m tools.studies.design_choices --steps 1000 --seeds 1
 
-Each row changes one setting of the default and is the mean over the seeds: PSNR in dB, its spread between seeds, SSIM,
-number of Gaussians, bytes and training steps per second. Scores are those of the decoded `paper` file on held-out
-views. A difference between rows is significant only if it is larger than the spread.
+This makes the table of docs/research/paper-and-code.md, and one more row, for the points that training starts from
+(docs/research/initial-points.md). Runs are kept in --out and are not repeated. Each row changes one setting of the
+default and is the mean over the seeds: PSNR in dB, its spread between seeds, SSIM, number of Gaussians, bytes and
+training steps per second. Scores are those of the decoded `paper` file on held-out views. A difference between rows is
+significant only if it is larger than the spread.
 """
 
 from __future__ import annotations
 
+import re
 import statistics
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -81,12 +84,17 @@ def _shrink_stored_factor(scale_logits: Tensor, fractions: Tensor) -> Tensor:
     return logit(torch.sigmoid(scale_logits) / density.SPLIT_SHRINK)
 
 
+def run_folder(out: Path, variant: str, name: str, seed: int) -> Path:
+    """Return the folder of the run of a variant on the data set `name`; no other variant has it."""
+    return out / f"{re.sub('[^a-z0-9]+', '-', variant.lower()).strip('-')}-{name}-{seed}"
+
+
 def main() -> None:
     args = make_study_parser(
         __doc__, steps=2000, sets=["mipnerf360_bonsai", "gerrard_hall"], out=Path("runs/design")
     ).parse_args()
     print(markdown_table(("variant", "set", "PSNR", "spread", "SSIM", "Gaussians", "bytes", "steps/s"), []))
-    for number, (variant, choice) in enumerate(CHOICES_BY_VARIANT.items()):
+    for variant, choice in CHOICES_BY_VARIANT.items():
         if args.only and not any(part in variant for part in args.only):
             continue
         for name in args.sets:
@@ -95,7 +103,7 @@ def main() -> None:
                     measure(
                         args.data,
                         name,
-                        args.out / str(args.steps) / f"{number}-{name}-{seed}",
+                        run_folder(args.out / str(args.steps), variant, name, seed),
                         replace(TrainConfig(steps=args.steps, seed=seed, budget_factor=1.0), **choice.training),
                         reuse=True,
                     )
