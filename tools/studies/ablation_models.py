@@ -31,8 +31,9 @@ SH_REST_RATE_RATIO = 1 / 20  # the learning rate of bands 1 to 3 over that of ba
 class SingleField(HybridModel):
     """A model with one grid and one decoder for geometry and radiance.
 
-    The table has twice the rows of the radiance table, which is a third more than both tables together, as in the
-    paper. Geometry does not depend on the view, because it is evaluated with the direction's inputs at zero.
+    The table has twice the rows of the radiance table on levels that fill it, as in the paper. That is at most a third
+    more rows than both tables have together. Geometry does not depend on the view, because it is evaluated with the
+    direction's inputs at zero.
     """
 
     def __init__(self, config: ModelConfig, gaussians: Gaussians, generator: torch.Generator | None = None) -> None:

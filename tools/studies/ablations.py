@@ -1,11 +1,13 @@
 """Run the HyRF paper's ablations on real data sets: measure what each part of the model contributes.
 
-    python -m tools.studies.ablations            trains every variant, prints the tables of docs/research/ablations.md
+    python -m tools.studies.ablations            trains every variant and prints the tables
     python -m tools.studies.ablations --reuse    trains only variants that --out does not have yet
 
-The tables give PSNR in dB, SSIM, bytes, training steps per second and frames per second, with the paper's differences.
-Scores are those of the trained model before compression on held-out views. Frames of a variant alternate with frames of
-the full model, and the geometry is decoded beforehand. The numbers of each run are stored in --out as JSON.
+The first two tables, with the paper's differences, are in docs/research/ablations.md but for columns that count the
+sets that lose and the training steps per second. One more table for each data set has all numbers: PSNR in dB, SSIM,
+Gaussians, bytes, training steps per second and frames per second. Scores are those of the trained model before
+compression on held-out views. Frames of a variant alternate with frames of the full model, and the geometry is decoded
+beforehand. The numbers of each run are stored in --out as JSON.
 """
 
 from __future__ import annotations
