@@ -10,9 +10,11 @@ import platform
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
+from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from hyrfpack.errors import HyrfError, install_command, short_reason
+from hyrfpack.parallel.threads import thread_count
 from hyrfpack.version import __version__
 
 if TYPE_CHECKING:
@@ -49,7 +51,8 @@ class MachineReport:
     Attributes:
         versions: versions of hyrfpack, Python and COMPUTING_PACKAGES; None for a package that is not installed.
         system: the operating system.
-        cpu, cores, memory_bytes: the processor, the cores that this process may use, and its memory.
+        cpu, cores, memory_bytes: the processor, the cores that this process may use, and its memory; None if torch or
+            numpy cannot be imported.
         gpus: each GPU that torch sees: "name", "memory_bytes", "driver" and "capability" (major.minor, or gfx...).
         device: the device that was asked for, as torch names it; None if there is none.
         self_test: result of the self-test of the kernels of this device; None if it has none or none was asked for.
@@ -61,7 +64,7 @@ class MachineReport:
     system: str
     cpu: str
     cores: int
-    memory_bytes: int
+    memory_bytes: int | None
     gpus: list[dict[str, Any]]
     device: str | None
     self_test: SelfTest | None
@@ -69,8 +72,14 @@ class MachineReport:
     problems: list[str]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the report as values that JSON can store."""
-        return asdict(self)
+        """Return the report as values that JSON can store; an error of a kernel that is not finite is None."""
+        values = asdict(self)
+        if self.self_test is not None:
+            values["self_test"]["rows"] = [
+                {key: None if isinstance(value, float) and not isfinite(value) else value for key, value in row.items()}
+                for row in self.self_test.rows
+            ]
+        return values
 
 
 def diagnose_machine(device: str = "auto", *, self_test: bool = True) -> MachineReport:
@@ -105,9 +114,9 @@ def diagnose_machine(device: str = "auto", *, self_test: bool = True) -> Machine
     try:
         import numpy  # noqa: F401
         import torch  # noqa: F401
-    except (ImportError, OSError):
-        nothing: dict[str, Any] = {"cpu": platform.machine(), "cores": 0, "memory_bytes": 0, "gpus": [], "device": None}
-        return MachineReport(**facts, **nothing, self_test=None)
+    except Exception:  # a broken torch raises errors of many types
+        unknown: dict[str, Any] = {"memory_bytes": None, "gpus": [], "device": None, "self_test": None}
+        return MachineReport(**facts, cpu=platform.machine(), cores=thread_count(), **unknown)
     return MachineReport(**facts, **_describe_devices(device, self_test, problems))
 
 
@@ -118,7 +127,6 @@ def _describe_devices(name: str, self_test: bool, problems: list[str]) -> dict[s
     from hyrfpack.data.cache import memory_bytes
     from hyrfpack.device import choose_device, describe_device
     from hyrfpack.measure.machine import driver_version, processor_name
-    from hyrfpack.parallel.threads import thread_count
 
     gpus: list[dict[str, Any]] = []
     for number in range(torch.cuda.device_count() if torch.cuda.is_available() else 0):

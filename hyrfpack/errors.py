@@ -113,8 +113,9 @@ def named_in_errors(path: object, name: str) -> Iterator[None]:
 
 
 def short_reason(error: Exception, max_length: int = 120) -> str:
-    """Return the first line of another library's error message, or the error's type, to be quoted in one of ours."""
-    return str(error).splitlines()[0][:max_length] if str(error) else type(error).__name__
+    """Return the first line with text of another library's error message, or the error's type, to be quoted in ours."""
+    lines = str(error).strip().splitlines()
+    return lines[0][:max_length] if lines else type(error).__name__
 
 
 def missing_package(error: ModuleNotFoundError) -> str | None:

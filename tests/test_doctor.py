@@ -6,6 +6,7 @@ import json
 import sys
 from dataclasses import replace
 from importlib.metadata import version
+from math import inf, nan
 
 import pytest
 import torch
@@ -41,6 +42,14 @@ def test_json_is_the_whole_report(broken_kernels):
     assert "kernels of mlp: outputs is NaN" in found["problems"]
 
 
+def test_json_stores_an_error_that_is_not_finite_as_null(monkeypatch):
+    (row,) = BROKEN_MLP_TEST.rows
+    broken = replace(BROKEN_MLP_TEST, rows=({**row, "value error": inf, "gradient error": nan},))
+    monkeypatch.setattr("hyrfpack.self_test.run_self_test", lambda *_: broken)
+    found = json.loads(succeeded("doctor", "--json", "--device", "cpu").stdout)
+    assert found["self_test"]["rows"] == [{**row, "value error": None, "gradient error": None}]
+
+
 def test_the_text_is_a_block_to_paste_and_names_broken_kernels(broken_kernels):
     lines = succeeded("doctor", "--device", "cpu").stdout.splitlines()
     assert lines[0] == lines[-1] == "```"
@@ -71,11 +80,21 @@ def test_missing_and_broken_packages_are_reported_with_what_they_are_for(monkeyp
     assert not any("pycolmap" in problem for problem in report.problems)
 
 
-def test_a_torch_that_cannot_be_imported_is_a_problem_and_not_the_end(monkeypatch):
-    monkeypatch.setattr(doctor, "_import_problem", lambda name: "torch cannot be imported" if name == "torch" else None)
-    monkeypatch.setitem(sys.modules, "torch", None)
-    report = diagnose_machine()
-    assert report.device is None and report.problems == ["torch cannot be imported"]
+@pytest.mark.parametrize("error", [ImportError, OSError, RuntimeError, SystemError, AttributeError])
+def test_a_torch_that_cannot_be_imported_is_a_problem_and_not_the_end(error, monkeypatch):
+    class Refuses:
+        def find_spec(self, name, path=None, target=None):
+            if name == "torch":
+                raise error("\nlibcudart.so is damaged")
+
+    monkeypatch.delitem(sys.modules, "torch")
+    monkeypatch.setattr(sys, "meta_path", [Refuses(), *sys.meta_path])
+    monkeypatch.setattr(doctor, "OPTIONAL_PACKAGES", {})
+    monkeypatch.setenv("HYRFPACK_THREADS", "3")
+    lines = succeeded("doctor").stdout.splitlines()
+    assert "problem: torch cannot be imported: libcudart.so is damaged" in lines
+    assert lines[3].startswith("CPU: ") and lines[3].endswith(", 3 cores, unknown memory")
+    assert "device: none" in lines and "self-test: not run" in lines
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

@@ -18,7 +18,7 @@ from scenes import small_model
 import hyrfpack
 from hyrfpack.cli import main
 from hyrfpack.data import load_scene
-from hyrfpack.errors import HyrfDataError, HyrfError, HyrfSizeError, needs_package, strip_path
+from hyrfpack.errors import HyrfDataError, HyrfError, HyrfSizeError, needs_package, short_reason, strip_path
 from hyrfpack.evaluate.figures import draw_training_curve
 from hyrfpack.format import save_model
 
@@ -54,6 +54,14 @@ def test_every_error_names_its_fix():
 
 def test_settings_are_named_in_the_fix_where_the_command_line_translates_them():
     assert [place for place, call in raised_errors() if "`" in literal_text(call.args[0])] == []
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [("a\nb", "a"), ("\n \n  no module\nmore", "no module"), ("", "ValueError"), (" \n", "ValueError")],
+)
+def test_a_quoted_reason_is_the_first_line_with_text_or_the_type(message, reason):
+    assert short_reason(ValueError(message)) == reason
 
 
 def test_an_error_is_one_line_of_problem_and_fix():

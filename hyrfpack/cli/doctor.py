@@ -9,6 +9,7 @@ import click
 from hyrfpack.cli.common import device_option, is_self_test_wanted, json_option, print_json
 from hyrfpack.cli.console import print_line
 from hyrfpack.cli.wording import use_option_names
+from hyrfpack.counts import format_count
 
 if TYPE_CHECKING:
     from hyrfpack.doctor import MachineReport
@@ -47,7 +48,8 @@ def _format_report(report: MachineReport) -> list[str]:
     """Return the report as lines of text."""
     versions = [f"{name} {found or 'is not installed'}" for name, found in report.versions.items()]
     lines = [", ".join(versions), report.system]
-    lines.append(f"CPU: {report.cpu}, {report.cores} cores, {report.memory_bytes / 2**30:.1f} GiB of memory")
+    memory = "unknown memory" if report.memory_bytes is None else f"{report.memory_bytes / 2**30:.1f} GiB of memory"
+    lines.append(f"CPU: {report.cpu}, {format_count(report.cores, 'core')}, {memory}")
     for number, gpu in enumerate(report.gpus):
         lines.append(
             f"GPU {number}: {gpu['name']}, {gpu['memory_bytes'] / 2**30:.1f} GiB, capability {gpu['capability']}, "
