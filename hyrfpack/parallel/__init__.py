@@ -16,6 +16,6 @@ def has_numba() -> bool:
     """
     try:
         import numba  # noqa: F401
-    except (ImportError, OSError):  # Numba rejects a numpy that is too new, and its compiler library may fail to load
+    except Exception:  # with a numpy that is too new or a broken compiler library, it raises errors of many types
         return False
     return True
