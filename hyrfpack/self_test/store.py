@@ -45,9 +45,17 @@ def load_self_test(device: torch.device) -> SelfTest | None:
     """Return the stored result of a self-test of this GPU with these versions, None if there is none."""
     try:
         values = json.loads(_path(device).read_text(encoding="utf-8"))["result"]
-        return SelfTest(values["implementation"], values["device"], tuple(values["rows"]))
+        rows = tuple(values["rows"])
+        return SelfTest(values["implementation"], values["device"], rows) if all(map(_is_row, rows)) else None
     except (OSError, ValueError, KeyError, TypeError, HyrfError):
         return None  # There is none, or it is damaged.
+
+
+def _is_row(value: object) -> bool:
+    """Return whether a stored value has what each row of a self-test has, and a failed one its reason."""
+    return (
+        isinstance(value, dict) and {"item", "operation"} <= value.keys() and ("status" not in value or "note" in value)
+    )
 
 
 def store_self_test(test: SelfTest, device: torch.device) -> None:

@@ -168,7 +168,21 @@ def test_mixed_precision_that_fails_alone_leaves_the_float32_kernels(gpu, monkey
     assert model.shading().mixed
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"result": {}}', '{"result": {"rows": 3}}', "\xff"])
+def stored_result(rows: object) -> str:
+    return json.dumps({"result": {"implementation": "gpu", "device": "cuda:0", "rows": rows}})
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "[]",
+        '{"result": {}}',
+        "\xff",
+        *map(stored_result, (3, "abc", ["mlp"], [{"item": "mlp"}], [{"operation": "mlp"}])),
+        stored_result([{"item": "mlp", "operation": "mlp", "status": "failed"}]),
+    ],
+)
 def test_a_damaged_result_is_tested_again(gpu, runs, content):
     store_self_test(FAILED_TEST, gpu)
     store._path(gpu).write_text(content, encoding="latin-1")
