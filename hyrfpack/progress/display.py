@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from importlib.util import find_spec
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
 
 from hyrfpack.progress.events import Progress, ignore_progress
 from hyrfpack.progress.status import Status
@@ -65,10 +65,14 @@ def _is_in_notebook() -> bool:
 
 def _can_redraw() -> bool:
     """Return whether standard error is a terminal that can redraw a line, and rich, which draws it, is installed."""
-    if find_spec("rich") is None:
+    if find_spec("rich") is None or not is_terminal(sys.stderr):
         return False
+    return os.environ.get("TERM", "").lower() not in ("dumb", "unknown")
+
+
+def is_terminal(stream: TextIO | None) -> bool:
+    """Return whether a standard stream is a terminal; it is None for a process that has none."""
     try:
-        is_terminal = sys.stderr.isatty()
+        return stream is not None and stream.isatty()
     except ValueError:  # It is closed.
         return False
-    return is_terminal and os.environ.get("TERM", "").lower() not in ("dumb", "unknown")

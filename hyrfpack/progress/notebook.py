@@ -64,7 +64,12 @@ class Curves:
         self._stride = 1
 
     def add(self, step: int, loss: float, psnr: float) -> None:
-        """Add a step, if it is one of those that are kept: at most MAX_CURVE_POINTS at equal distances."""
+        """Add a step, if it is one of those that are kept: at most MAX_CURVE_POINTS at equal distances.
+
+        A step that does not follow the last one begins the curves of another run.
+        """
+        if self._points and step <= self._points[-1][0]:
+            self._points, self._stride = [], 1
         if step % self._stride:
             return
         self._points.append((step, loss, psnr))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import suppress
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.live import Live
 from rich.text import Text
 
+from hyrfpack.progress.display import is_terminal
 from hyrfpack.progress.events import Event, StepEvent
 from hyrfpack.progress.status import PART_SEPARATOR, Status, StatusLine
 
@@ -18,15 +20,22 @@ MIN_BAR_COLUMNS, MAX_BAR_COLUMNS = 8, 24
 class TerminalDisplay:
     """Redraws one line on standard error, also between two events.
 
-    What is printed to standard error meanwhile appears above the line. The line of the last step of a training run
-    stays, others are removed at the end. If standard error is closed, the work continues.
+    What is printed to a terminal meanwhile appears above the line; what is printed to a file or a pipe goes there. The
+    line of the last step of a training run stays, others are removed at the end. If standard error is closed, the work
+    continues.
     """
 
     def __init__(self, status: Status) -> None:
         self._status = status
         # A terminal wraps long messages itself, so that a path in them can be copied.
         console = Console(stderr=True, soft_wrap=True)
-        self._live = Live(self, console=console, refresh_per_second=REFRESHES_PER_SECOND, transient=True)
+        self._live = Live(
+            self,
+            console=console,
+            refresh_per_second=REFRESHES_PER_SECOND,
+            transient=True,
+            redirect_stdout=is_terminal(sys.stdout),
+        )
 
     def __enter__(self) -> TerminalDisplay:
         with suppress(OSError, ValueError):

@@ -241,6 +241,14 @@ def test_a_note_appears_whole_above_the_line_of_a_terminal(monkeypatch):
     assert sentence in shown and shown[-1].startswith("2/5 training")
 
 
+def test_a_line_of_a_terminal_leaves_the_output_that_goes_to_a_file_where_it_is(monkeypatch, capsys):
+    terminal = open_terminal(monkeypatch)
+    with open_display() as progress:
+        progress(TRAINING_STAGE)
+        print("PSNR 31.5")
+    assert capsys.readouterr().out == "PSNR 31.5\n" and "31.5" not in terminal.getvalue()
+
+
 def test_the_line_of_the_last_step_stays_and_that_of_a_task_is_removed(monkeypatch):
     terminal = open_terminal(monkeypatch)
     with open_display() as progress:
@@ -475,3 +483,12 @@ def test_curves_of_a_long_run_keep_few_points_from_its_start_to_its_end():
     points = re.search('points="([^"]*)"', curves.svg())[1].split()
     assert MAX_CURVE_POINTS / 2 <= len(points) <= MAX_CURVE_POINTS
     assert points[0].startswith("0.0,") and points[-1].startswith("320.0,")
+
+
+def test_the_curves_of_a_second_run_begin_anew():
+    curves = Curves()
+    for step in (1, 2, 3, 1):
+        curves.add(step, 0.5, 20.0)
+    assert curves.svg() == ""
+    curves.add(2, 0.25, 20.0)
+    assert "loss 0.25 to 0.5" in curves.svg() and len(re.search('points="([^"]*)"', curves.svg())[1].split()) == 2
