@@ -50,7 +50,8 @@ def merge_moments(gaussians: Moments, labels: np.ndarray, count: int) -> Moments
 
         mean = sum m_i p_i / sum m_i      covariance = sum m_i (C_i + (p_i - mean) (p_i - mean)^T) / sum m_i,
 
-    the mean colour, and the opacity sum m_i / area, at most MAX_OPACITY, so that it covers as much as they did.
+    the mean colour, and the opacity sum m_i / area, at most MAX_OPACITY, so that it covers as much as they did. If all
+    opacities of a cluster are 0, its Gaussians have equal weights.
 
     Args:
         gaussians: N Gaussians.
@@ -59,11 +60,13 @@ def merge_moments(gaussians: Moments, labels: np.ndarray, count: int) -> Moments
     """
     light = gaussians.opacities * gaussians.areas
     total = np.bincount(labels, light, count)
+    weights = np.where(total[labels] > 0, light, 1.0)
+    weight_sums = np.bincount(labels, weights, count)
 
     def average(values: np.ndarray) -> np.ndarray:
-        flat = (light[:, None] * values.reshape(len(values), -1)).T
+        flat = (weights[:, None] * values.reshape(len(values), -1)).T
         sums = np.stack([np.bincount(labels, column, count) for column in flat], axis=1)
-        return (sums / total[:, None]).reshape(count, *values.shape[1:])
+        return (sums / weight_sums[:, None]).reshape(count, *values.shape[1:])
 
     means = average(gaussians.means)
     offsets = gaussians.means - means[labels]

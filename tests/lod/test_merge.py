@@ -62,6 +62,26 @@ def test_merging_copies_of_one_gaussian_gives_it_back():
     np.testing.assert_allclose(merged.opacities, 3 * part.opacities)
 
 
+def test_a_cluster_without_opacity_becomes_an_invisible_gaussian_at_its_mean():
+    parts = random_moments(4, np.random.default_rng(2))
+    parts.opacities[:2] = 0
+
+    merged = merge_moments(parts, np.array([0, 0, 1, 1]), 2)
+
+    np.testing.assert_allclose(merged.means[0], parts.means[:2].mean(axis=0))
+    np.testing.assert_allclose(merged.colors[0], parts.colors[:2].mean(axis=0))
+    assert merged.opacities[0] == 0 and merged.opacities[1] > 0 and np.isfinite(merged.covariances).all()
+
+
+def test_invisible_gaussians_merge_to_finite_ones_that_are_invisible():
+    model = small_model(POSITIONS, fields=0.5, opacity_logits=-300.0).requires_grad_(False)
+
+    merged = model.with_gaussians(merge_gaussians(model, model.decode_geometry(), [torch.zeros(3)], 12))
+
+    assert all(torch.isfinite(parameter).all() for parameter in merged.parameters())
+    assert merged.decode_geometry().opacities.max() < 1e-5  # the logit of 0 is finite
+
+
 def test_fitted_logits_give_the_volume_the_opacity_and_the_colour_of_a_view():
     model = small_model(POSITIONS, fields=0.5)
     geometry = model.decode_geometry()
