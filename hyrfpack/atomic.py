@@ -120,7 +120,7 @@ def pending_file(
 def numbered_names(path: Path) -> Iterator[Path]:
     """Yield a path, then paths beside it with a number from 2 on between stem and suffix.
 
-    A suffix has one or two parts, each of which begins with a letter.
+    A suffix has one or two parts, each of which begins with a letter. One of over half a name is part of the stem.
 
     Example:
         >>> from itertools import islice
@@ -130,6 +130,8 @@ def numbered_names(path: Path) -> Iterator[Path]:
     yield path
     match = _STEM_AND_SUFFIX.fullmatch(path.name)
     stem, suffix = match.groups() if match else (path.name, "")
+    if len(os.fsencode(suffix)) > MAX_NAME_BYTES // 2:
+        stem, suffix = path.name, ""
     for number in itertools.count(2):
         end = f"-{number}{suffix}"
         while len(os.fsencode(stem + end)) > MAX_NAME_BYTES:

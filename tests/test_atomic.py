@@ -317,6 +317,7 @@ def test_without_overwrite_a_relative_path_is_returned_as_a_relative_path(tmp_pa
         ("no suffix", "no suffix-2"),
         (".hidden", ".hidden-2"),
         (".hidden.hyrf", ".hidden-2.hyrf"),
+        ("a." + "b" * 253, "a." + "b" * 251 + "-2"),
         ("\u00fc" * 125 + ".hyrf", "\u00fc" * 124 + "-2.hyrf"),  # 255 bytes, because each letter takes two
     ],
 )
