@@ -9,8 +9,11 @@ from contextlib import contextmanager
 from hyrfpack.errors import HyrfError, short_reason
 
 MAX_REASON_LENGTH = 160
-# What CUDA, HIP and Triton say where torch's allocator was not asked: a library's memory, a kernel's code or stack.
-_GPU_MESSAGE = re.compile(r"(CUDA|HIP)( driver)? error: out of memory|Triton Error \[\w+\]:.*out of memory")
+# What CUDA, HIP, their libraries (cuBLAS, cuDNN) and Triton say where torch's allocator was not asked: a library's
+# memory, a kernel's code or stack.
+_GPU_MESSAGE = re.compile(
+    r"(CUDA|HIP)( driver)? error: out of memory|_STATUS_ALLOC_FAILED|Triton Error \[\w+\]:.*out of memory"
+)
 
 
 @contextmanager
@@ -46,6 +49,7 @@ def describe_out_of_memory(error: BaseException) -> str | None:
     if isinstance(error, MemoryError):
         return f"memory ran out ({short_reason(error, MAX_REASON_LENGTH)})"
     if isinstance(error, RuntimeError) and "DefaultCPUAllocator" in str(error):
-        allocator_message = str(error).partition("DefaultCPUAllocator: ")[2].splitlines()[0]
-        return f"memory ran out ({allocator_message[:MAX_REASON_LENGTH]})"
+        # The message may begin with a place in torch's source.
+        message = str(error).partition("DefaultCPUAllocator: ")[2] or str(error)
+        return f"memory ran out ({short_reason(RuntimeError(message), MAX_REASON_LENGTH)})"
     return None

@@ -32,6 +32,9 @@ def test_a_gpu_without_memory_is_one_sentence():
         "CUDA error: out of memory\nCUDA kernel errors might be asynchronously reported at some other API call",
         "CUDA driver error: out of memory",
         "HIP error: out of memory",
+        "CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`",
+        "cuDNN error: CUDNN_STATUS_ALLOC_FAILED",
+        "cusolver error: CUSOLVER_STATUS_ALLOC_FAILED, when calling `cusolverDnCreate(handle)`",
         "Triton Error [CUDA]: out of memory",
         "Triton Error [HIP]:  Code: 2, Messsage: out of memory",
     ],
@@ -46,6 +49,22 @@ def test_errors_of_the_driver_and_of_triton_that_memory_ran_out_are_recognised(m
 def test_a_machine_without_memory_is_one_sentence(allocate):
     with pytest.raises(HyrfError, match=r"memory ran out \(.*\); reduce it"), explain_out_of_memory("reduce it"):
         allocate()
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (
+            "[enforce fail at alloc.cpp:1] err. DefaultCPUAllocator: can't allocate 8 bytes\nmore",
+            "can't allocate 8 bytes",
+        ),
+        ("DefaultCPUAllocator failed", "DefaultCPUAllocator failed"),
+    ],
+)
+def test_the_reason_of_the_cpu_allocator_is_quoted(message, reason):
+    with pytest.raises(HyrfError) as caught, explain_out_of_memory("reduce it"):
+        raise RuntimeError(message)
+    assert str(caught.value) == f"memory ran out ({reason}); reduce it"
 
 
 @pytest.mark.parametrize("message", ["shapes differ", "CUDA error: an illegal memory access was encountered"])
