@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfError
 from hyrfpack.kernel_errors import PLAIN_TORCH_VARIABLE
 from hyrfpack.ops.dispatch import (
@@ -76,13 +77,15 @@ def choose_device(name: str | torch.device = "auto", *, self_test: bool = True) 
         kind = name = "cuda" if torch.cuda.is_available() and has_triton() else "cpu"
     if kind == "cuda":
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-        if int(number or 0) >= count:
-            there = (
-                f"torch sees {count} {'GPU' if count == 1 else 'GPUs'}" if count else "torch sees no NVIDIA or AMD GPU"
-            )
+        if not count:
             raise HyrfError(
-                f"device '{name}' is not available: {there}",
+                f"device '{name}' is not available: torch sees no NVIDIA or AMD GPU",
                 fix="install a GPU build of torch or use `device='cpu'`",
+            )
+        if int(number or 0) >= count:
+            raise HyrfError(
+                f"device '{name}' is not available: torch sees {format_count(count, 'GPU')}",
+                fix="use `device='cuda:0'`" if count == 1 else f"use a number from 0 to {count - 1}",
             )
         if is_named and not has_triton():
             _LOG.warning(NO_TRITON_NOTE)

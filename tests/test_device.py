@@ -55,8 +55,14 @@ def test_a_text_that_names_no_device_is_rejected(name):
 
 
 def test_a_gpu_beyond_the_last_is_rejected():
-    with use_fake_gpu(), pytest.raises(HyrfError, match="cuda:1.*sees 1 GPU;"):
+    with use_fake_gpu(), pytest.raises(HyrfError, match="cuda:1.*sees 1 GPU; use `device='cuda:0'`$"):
         choose_device("cuda:1")
+
+
+def test_a_gpu_beyond_the_last_of_several_is_rejected_with_the_numbers_that_there_are(monkeypatch):
+    with use_fake_gpu(), pytest.raises(HyrfError, match="cuda:5.*sees 2 GPUs; use a number from 0 to 1$"):
+        monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+        choose_device("cuda:5")
 
 
 @pytest.mark.parametrize("name", ["auto", "cuda", "cuda:0"])
