@@ -159,3 +159,14 @@ def test_figures_without_matplotlib_are_a_clear_error(hide_package, tmp_path):
 
     with pytest.raises(HyrfError, match="drawing figures needs matplotlib"):
         draw_training_curve([{"step": 1, "psnr": 20.0, "loss": 0.1, "gaussians": 1}], tmp_path / "curve.png")
+
+
+def test_commands_that_end_with_a_figure_miss_matplotlib_before_their_work(hide_package, monkeypatch, tmp_path):
+    save_model(small_model([(0, 0, 0)]), tmp_path / "a.hyrf")
+    hide_package("matplotlib")
+    for work in ("bench.suite.benchmark_model", "compress.compress_model", "report.compression.describe_file"):
+        monkeypatch.setattr(f"hyrfpack.{work}", lambda *_, **__: pytest.fail("the work has begun"))
+
+    assert "drawing figures needs matplotlib" in refused("bench", tmp_path / "a.hyrf", "-o", tmp_path / "a.png")
+    written = ("-o", tmp_path / "b.hyrf", "--report", tmp_path / "page")
+    assert "drawing figures needs matplotlib" in refused("compress", tmp_path / "a.hyrf", *written)

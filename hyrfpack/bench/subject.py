@@ -92,7 +92,7 @@ class Subject:
         """Describe the model, and what quality is measured against, in one sentence."""
         camera = self.cameras[0]
         against = (
-            f"quality against {len(self.photos)} held-out photos"
+            f"quality against {format_count(len(self.photos), 'held-out photo')}"
             if self.photos
             else f"quality against exact renders of the model from {len(self.cameras)} viewpoints around the scene"
         )
@@ -133,7 +133,10 @@ def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
 
 
 def built_in_subject() -> Subject:
-    """Train a small model on the demo's scene in a temporary folder; the result is the same every time."""
+    """Train a small model on the demo's scene in a temporary folder.
+
+    It trains on the CPU, also beside a GPU, so that the result is the same every time.
+    """
     _LOG.info(
         f"training the built-in model: {BUILT_IN_STEPS:,} steps on a synthetic scene, about a minute on two cores"
     )
@@ -142,7 +145,7 @@ def built_in_subject() -> Subject:
             write_demo_scene(Path(folder) / "scene", views=BUILT_IN_PHOTOS, size=BUILT_IN_PHOTO_SIDE_PIXELS)
         )
         trained = train_model(
-            scene, Path(folder) / "run", TrainConfig(steps=BUILT_IN_STEPS), context=RunContext(progress=None)
+            scene, Path(folder) / "run", TrainConfig(steps=BUILT_IN_STEPS), context=RunContext("cpu", progress=None)
         )
         if trained.model is None:  # training treats Ctrl-C as a request to stop
             raise KeyboardInterrupt

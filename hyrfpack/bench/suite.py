@@ -36,7 +36,7 @@ class BenchReport:
     """Results of `benchmark_model`.
 
     Attributes:
-        machine: the machine that the times belong to, see `describe_machine`.
+        machine: the processor that the times belong to, and versions, see `describe_machine`.
         subject: one sentence about the model, and about what quality is measured against.
         notes: sentences about what was left out or cut short.
         rows: the measurements in order.
@@ -59,7 +59,7 @@ def benchmark_model(
     repeats: int = 7,
     only: Sequence[str] | None = None,
 ) -> BenchReport:
-    """Measure the time and the error of operations, renderer settings and file profiles on a model.
+    """Measure the time and the error of operations, renderer settings and file profiles on a model, on the CPU.
 
     The values of one setting are measured in turns, so that ratios are valid on a busy machine. All cores are used;
     torch uses as many threads as it is set to. Set the environment variable OMP_WAIT_POLICY=PASSIVE before torch is

@@ -68,7 +68,7 @@ def bench(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Measure the time and the error of each operation, and of each setting that trades accuracy for time.
+    """Measure the time and the error of each operation, and of each setting that trades accuracy for time, on the CPU.
 
     MODEL is the folder of a run or a .hyrf file. Without MODEL, a small model is first trained on a synthetic scene,
     which takes about a minute. Quality is given as PSNR and SSIM: against the held-out photos of --data, or without
@@ -88,11 +88,13 @@ def bench(
     from hyrfpack.bench import tables
     from hyrfpack.bench.figure import plot, plot_format
     from hyrfpack.bench.suite import benchmark_model as measure
+    from hyrfpack.evaluate.figures import require_matplotlib
     from hyrfpack.format import describe_file
     from hyrfpack.measure.machine import format_machine
 
     model = None if model is None else resolve_model_file(model)
     plot_format(output)
+    require_matplotlib()
     scene = None if data is None or model is None else read_scene(data, reader_options, describe_file(model))
     outputs = Outputs(model, scene=scene, overwrite=overwrite)
     outputs.file(output)

@@ -106,6 +106,9 @@ def compress(
         outputs = Outputs(model, scene=scene, overwrite=overwrite)
         outputs.file(output, ".hyrf")
         if report is not None:
+            from hyrfpack.evaluate.figures import require_matplotlib
+
+            require_matplotlib()
             outputs.folder(report, REPORT_FILES)
         return scene
 

@@ -159,6 +159,16 @@ def _quiet_matplotlib() -> Iterator[None]:
         yield
 
 
+def require_matplotlib() -> None:
+    """Check that figures can be drawn, before work whose result is a figure.
+
+    Raises:
+        HyrfError: matplotlib is not installed.
+    """
+    with _quiet_matplotlib():
+        import matplotlib.figure  # noqa: F401
+
+
 def blank_figure(width: float, height: float, layout: Literal["constrained"] | None = "constrained") -> Figure:
     """Return an empty matplotlib figure with the Agg backend, which needs no display.
 

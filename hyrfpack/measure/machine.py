@@ -18,17 +18,14 @@ _DRIVER_FILES = {"/proc/driver/nvidia/version": r"\d+\.\d+(?:\.\d+)?", "/sys/mod
 
 
 def describe_machine() -> dict[str, object]:
-    """Return facts that run times depend on: processor, cores in use, GPU, and versions of packages."""
-    facts: dict[str, object] = {
+    """Return facts that run times on the CPU depend on: processor, cores in use, and versions of packages."""
+    return {
         "cpu": processor_name(),
         "cores": thread_count(),
         "python": platform.python_version(),
         "hyrfpack": __version__,
         **package_versions("torch", "numba", "numpy"),
     }
-    if torch.cuda.is_available():
-        facts["gpu"] = torch.cuda.get_device_name()
-    return facts
 
 
 def package_versions(*packages: str) -> dict[str, str | None]:

@@ -24,6 +24,7 @@ from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import Evaluation, evaluate_model
+from hyrfpack.evaluate.figures import require_matplotlib
 from hyrfpack.evaluate.metrics import psnr, to_8bit
 from hyrfpack.format.codec import (
     decode_model,
@@ -97,8 +98,10 @@ def write_compression_report(
         The path of the page. It is written last, so if it exists, all pictures that it shows exist.
 
     Raises:
-        HyrfError: a file cannot be read, the folder cannot be written, or another call is writing into it.
+        HyrfError: a file cannot be read, the folder cannot be written, another call is writing into it, or matplotlib
+            is missing.
     """
+    require_matplotlib()
     folder, source, packed = Path(folder), Path(source), Path(packed)
     Outputs(source, packed, scene=scene, overwrite=True).folder(folder, REPORT_FILES)
     with exclusive_folder(folder, "another folder with `report`"):

@@ -321,7 +321,16 @@ def test_the_built_in_model_is_measured_on_its_own_photos(monkeypatch, caplog):
     monkeypatch.setattr(subject, "BUILT_IN_STEPS", 2)
     monkeypatch.setattr(subject, "BUILT_IN_PHOTOS", 9)
     monkeypatch.setattr(subject, "BUILT_IN_PHOTO_SIDE_PIXELS", 32)
+    devices = []
+    train = subject.train_model
+
+    def record_device(*arguments, context):
+        devices.append(context.device)
+        return train(*arguments, context=context)
+
+    monkeypatch.setattr(subject, "train_model", record_device)
     report = benchmark_model(only=["mlp"], repeats=1)
+    assert devices == ["cpu"]
     assert "built-in" in report.subject and "2 held-out photos" in report.subject
     assert "2 steps" in caplog.messages[0] and "minute" in caplog.messages[0]
 
