@@ -61,9 +61,9 @@ def info(path: Path, as_json: bool) -> None:
         path.is_file() and path.suffix.lower() in (*ARCHIVE_SUFFIXES, *VIDEO_SUFFIXES, *PICTURE_SUFFIXES)
     ):
         _print_photos(path, as_json)
-    elif path.suffix.lower() == ".json":
+    elif path.is_file() and path.suffix.lower() == ".json":
         raise HyrfError(f"{path}: poses are described with their photos", fix="name the folder that holds the photos")
-    elif path.suffix.lower() in EXPORT_ONLY_SUFFIXES:
+    elif path.is_file() and path.suffix.lower() in EXPORT_ONLY_SUFFIXES:
         raise HyrfError(
             f"{path}: files with this extension are written for other programs and not read",
             fix="name the model, splats (.ply, .splat, .spz, .sog), or a folder of photos",
@@ -116,7 +116,7 @@ def _print_scene(path: Path, as_json: bool) -> None:
         print_json(facts)
         return
     scene, name = facts["scene"], path.parent if path.name == "scene.json" else path
-    click.echo(
+    print_line(
         f"{name}: {facts['bytes']:,} bytes, {format_count(facts['gaussians'], 'Gaussian')} in "
         f"{format_count(len(scene['chunks']), 'chunk')}"
     )
@@ -149,7 +149,7 @@ def _print_splats(path: Path, as_json: bool) -> None:
     if as_json:
         print_json(facts.to_dict())
         return
-    click.echo(f"{path}: {facts.bytes:,} bytes, {format_count(facts.gaussians, 'Gaussian')}")
+    print_line(f"{path}: {facts.bytes:,} bytes, {format_count(facts.gaussians, 'Gaussian')}")
     rows = [
         ("format", facts.format + (", antialiased" if facts.antialiased else "")),
         ("bytes/Gaussian", f"{facts.bytes / max(facts.gaussians, 1):.1f}"),
@@ -174,7 +174,7 @@ def _print_model(file: Path, as_json: bool) -> None:
 
 def _print_model_facts(file: Path, facts: dict) -> None:
     config, provenance = facts["config"], facts["provenance"]
-    click.echo(f"{file}: {facts['bytes']:,} bytes, {format_count(facts['gaussians'], 'Gaussian')}")
+    print_line(f"{file}: {facts['bytes']:,} bytes, {format_count(facts['gaussians'], 'Gaussian')}")
     print_line(f"written by {facts['writer']}, format {facts['version']}, profile {facts['profile']}")
     if "parts" in facts:
         rows = [

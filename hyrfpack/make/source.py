@@ -14,8 +14,7 @@ from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
 from hyrfpack.make.held_out import choose_inner_view
 from hyrfpack.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs, StrPath
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
-from hyrfpack.splats.files import READABLE_ENDINGS
-from hyrfpack.splats.names import SOG_META_NAME, is_sog_folder
+from hyrfpack.splats.names import SOG_META_NAME, is_sog_folder, is_splats
 
 MIN_SPLIT_PHOTOS = 16  # if there are fewer photos, a single one is held out
 MIN_HELD_OUT_PHOTOS = 8  # if there are fewer photos, none is held out
@@ -75,7 +74,7 @@ class Source:
         if not os.path.lexists(path):
             raise HyrfDataError(f"{path}: no such file or folder", fix="check the path")
         ending = path.suffix.lower()
-        if path.is_file() and (ending == ".hyrf" or ending in READABLE_ENDINGS or path.name == SOG_META_NAME):
+        if path.is_file() and (ending == ".hyrf" or is_splats(path)):
             return cls(path, "model" if ending == ".hyrf" else "splats")
         if path.is_file() and not (is_archive(path) or ending in VIDEO_SUFFIXES):
             what = "this is one photo" if ending in PICTURE_SUFFIXES else "nothing can be made of this file"

@@ -16,7 +16,7 @@ def is_splats(path: str | os.PathLike[str]) -> bool:
     Such a path ends in one of SPLATS_SUFFIXES, or is the folder or the meta.json of an unbundled SOG.
     """
     path = Path(path)
-    return path.suffix.lower() in SPLATS_SUFFIXES or path.name == SOG_META_NAME or is_sog_folder(path)
+    return path.suffix.lower() in SPLATS_SUFFIXES or is_sog_folder(path.parent if path.name == SOG_META_NAME else path)
 
 
 def is_sog_folder(path: Path) -> bool:

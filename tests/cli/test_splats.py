@@ -51,7 +51,19 @@ def test_every_ending_of_splats_is_recognised():
 
 def test_a_folder_with_another_meta_json_is_not_read_as_splats(tmp_path):
     (tmp_path / "meta.json").write_text('{"camera": 1}')
-    assert not is_splats(tmp_path)
+    assert not is_splats(tmp_path) and not is_splats(tmp_path / "meta.json")
+    assert "poses are described with their photos" in refused("info", tmp_path / "meta.json")
+
+
+@pytest.mark.parametrize("name", ["none.glb", "none.json", "meta.json", "none.hyrf"])
+def test_info_says_of_a_missing_file_that_it_is_missing(name, tmp_path):
+    assert f"{name}: there is no such file" in refused("info", tmp_path / name)
+
+
+def test_info_prints_escapes_for_unprintable_characters_of_a_name(files, tmp_path):
+    path = tmp_path / "a\x1b[31m.ply"
+    path.write_bytes(files[".ply"].read_bytes())
+    assert succeeded("info", path).stdout.splitlines()[0].startswith(f"{tmp_path}/a\\x1b[31m.ply: ")
 
 
 @pytest.mark.parametrize("kind", FILE_KINDS)
