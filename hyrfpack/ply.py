@@ -174,16 +174,23 @@ def _parse_rows(lines: list[str], kinds: dict[str, str], label: str, name: str) 
     try:
         table = np.loadtxt(lines, np.float64, comments=None, ndmin=2)
     except ValueError as error:
+        for line in lines:
+            if (width := len(line.split())) != len(kinds):
+                raise _width_error(name, label, width, len(kinds)) from error
         raise HyrfDataError(
             f"{name}: a row of its element '{label}' is not made of numbers",
             fix="the file is damaged, export it again",
         ) from error
     if table.shape != (len(lines), len(kinds)):
-        raise HyrfDataError(
-            f"{name}: rows of its element '{label}' have {table.shape[1]} numbers, and the header says {len(kinds)}",
-            fix="export it again",
-        )
+        raise _width_error(name, label, table.shape[1], len(kinds))
     return np.ascontiguousarray(table).view(layout)[:, 0]
+
+
+def _width_error(name: str, label: str, width: int, expected: int) -> HyrfDataError:
+    return HyrfDataError(
+        f"{name}: the number of values in a row of element '{label}' is {width:,}, and the header says {expected:,}",
+        fix="the file is damaged, export it again",
+    )
 
 
 def _truncated_error(name: str, label: str, count: int) -> HyrfDataError:

@@ -75,7 +75,12 @@ def decode(data: bytes, name: str) -> Splats:
     rows = read_elements(data, header, {"vertex", "chunk"} | ({"sh"} if rest else set()), name)
     vertex, chunk = rows["vertex"], rows["chunk"]
     count = len(vertex)
-    if len(chunk) != -(-count // _GAUSSIANS_PER_CHUNK) or (rest and len(rows["sh"]) != count):
+    if rest and len(rows["sh"]) != count:
+        raise HyrfDataError(
+            f"{name}: its element 'sh' has {len(rows['sh']):,} rows for {count:,} Gaussians",
+            fix="the file is damaged, export it again",
+        )
+    if len(chunk) != -(-count // _GAUSSIANS_PER_CHUNK):
         raise HyrfDataError(
             f"{name}: {len(chunk):,} chunks do not fit {count:,} Gaussians, {_GAUSSIANS_PER_CHUNK} each",
             fix="the file is damaged, export it again",

@@ -95,7 +95,7 @@ VALID_FILE = build_compressed_ply(300, PACKED_WORDS)
         (build_compressed_ply(300, PACKED_WORDS, chunks=1), "1 chunks do not fit 300 Gaussians"),
         (build_compressed_ply(300, PACKED_WORDS, chunks=3), "3 chunks do not fit 300 Gaussians"),
         (build_compressed_ply(3, PACKED_WORDS, rest=8), "the element 'sh' has 8 properties"),
-        (build_compressed_ply(3, PACKED_WORDS, rest=9).replace(b"sh 3", b"sh 2"), "do not fit 3 Gaussians"),
+        (build_compressed_ply(3, PACKED_WORDS, rest=9).replace(b"sh 3", b"sh 2"), "'sh' has 2 rows for 3 Gaussians"),
         (VALID_FILE.replace(b"binary_little_endian", b"ascii"), "in text cannot be read"),
         (
             VALID_FILE.replace(np.array([0, 0, 0, 1, 2, 4], "<f4").tobytes(), np.full(6, np.nan, "<f4").tobytes()),

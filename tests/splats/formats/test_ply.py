@@ -196,8 +196,12 @@ VALID_FILE = build_ply(PROPERTY_NAMES, "float", VALID_ROW.tobytes(), 1)
             build_ply(PROPERTY_NAMES, "float", VALID_ROW.tobytes(), 1, before="element f 1\nproperty list int int i"),
             "that are lists",
         ),
-        (build_ply(PROPERTY_NAMES, "float", b"1 2 3\n", 1, "ascii"), "have 3 numbers, and the header says 14"),
-        (build_ply(PROPERTY_NAMES, "float", b"1 2 three\n", 1, "ascii"), "not made of numbers"),
+        (build_ply(PROPERTY_NAMES, "float", b"1 2 3\n", 1, "ascii"), "is 3, and the header says 14"),
+        (
+            build_ply(PROPERTY_NAMES, "float", b"1 " * 14 + b"\n1 2\n", 2, "ascii"),
+            "is 2, and the header says 14",
+        ),
+        (build_ply(PROPERTY_NAMES, "float", b"1 " * 13 + b"three\n", 1, "ascii"), "not made of numbers"),
         (build_ply(PROPERTY_NAMES, "float", b"\n \n", 1, "ascii"), "ends before the 1 rows"),
         (
             build_ply(PROPERTY_NAMES, "float", np.float32(np.nan).tobytes() * 14, 1),
