@@ -44,9 +44,7 @@ def usd_files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("usd")
     paths = {kind: folder / f"splats.{kind}" for kind in USD_EXTENSIONS}
     for kind, path in paths.items():
-        path.write_bytes(
-            usd.encode(sample_splats(3), Hints(UP_DIRECTION, make_camera()), extension=kind, meters_per_unit=0.5)
-        )
+        path.write_bytes(usd.encode(sample_splats(3), Hints(UP_DIRECTION, make_camera()), extension=kind))
     return paths
 
 
@@ -88,14 +86,14 @@ def test_openusd_reads_what_we_write(kind, degree, tmp_path):
 @pytest.mark.parametrize("up", np.concatenate((np.eye(3), -np.eye(3), UP_DIRECTION[None])))
 def test_the_stage_is_upright_and_declares_its_unit(up, tmp_path):
     path = tmp_path / "splats.usdc"
-    path.write_bytes(usd.encode(sample_splats(0), Hints(up), extension="usdc", meters_per_unit=0.5))
+    path.write_bytes(usd.encode(sample_splats(0), Hints(up), extension="usdc"))
     stage = Usd.Stage.Open(str(path))
     stage_from_prim = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(find_splats_prim(stage))).T
     turn = stage_from_prim[:3, :3]
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-6)
     assert np.linalg.det(turn) > 0
     np.testing.assert_allclose(turn @ up, np.eye(3)["XYZ".index(UsdGeom.GetStageUpAxis(stage))], atol=1e-6)
-    assert UsdGeom.GetStageMetersPerUnit(stage) == 0.5
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
 
 
 def test_a_stage_far_from_the_origin_keeps_its_precision(tmp_path):

@@ -9,7 +9,8 @@ import pytest
 from scenes import ring
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.splats.files import MAX_FILE_BYTES, READABLE_ENDINGS, encode_splats, read_splats
+from hyrfpack.splats.files import MAX_FILE_BYTES, READABLE_ENDINGS, read_splats
+from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats, normalized_quats
 from hyrfpack.splats.table import FORMATS
 
@@ -35,7 +36,7 @@ def random_splats(count: int = 50, center=(0, 0, 0), unit: float = 1.0) -> Splat
 
 
 def encode_with_camera(splats: Splats, extension: str) -> bytes:
-    return encode_splats(splats, extension, up=UP_DIRECTION, camera=ring(1)[0])
+    return FORMATS[extension].encode(splats, Hints(UP_DIRECTION, ring(1)[0]))
 
 
 @pytest.mark.parametrize("place", SCENE_CENTER_AND_UNIT)

@@ -50,9 +50,7 @@ _USDZ_ALIGNMENT_BYTES = 64
 _MAX_USDZ_BYTES = (1 << 32) - 1  # because a .usdz is a zip without 64-bit lengths
 
 
-def encode(
-    splats: Splats, hints: Hints = NO_HINTS, *, extension: Extension = "usdc", meters_per_unit: float = 1.0
-) -> bytes:
+def encode(splats: Splats, hints: Hints = NO_HINTS, *, extension: Extension = "usdc") -> bytes:
     """Encode splats as a USD file.
 
     The stored numbers keep the input's axes and units. Transforms turn the scene upright and, where it lies far from
@@ -65,7 +63,6 @@ def encode(
         hints: `up` and `camera` are used. The file's up axis is z where `up` is nearer to the world's z than to its y,
             otherwise y.
         extension: "usda" is text, "usdc" binary, "usdz" an uncompressed package of a binary file.
-        meters_per_unit: length of a world unit in metres.
 
     Raises:
         HyrfError: usd-core is missing.
@@ -77,7 +74,7 @@ def encode(
     stage = Usd.Stage.CreateInMemory()
     z_up = bool(hints.up[2] > abs(hints.up[1]))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z if z_up else UsdGeom.Tokens.y)
-    UsdGeom.SetStageMetersPerUnit(stage, meters_per_unit)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)  # the length of a world unit is not known
     stage.GetRootLayer().documentation = "3D Gaussians, written by hyrfpack"
     world = UsdGeom.Xform.Define(stage, "/World")
     stage.SetDefaultPrim(world.GetPrim())

@@ -75,8 +75,8 @@ def test_the_validators_of_openusd_report_nothing(pxr, tmp_path):
     ("up", "axis"), [(Y_DOWN, "Y"), (Z_UP, "Z"), (-Z_UP, "Y"), (np.array([0.48, -0.6, 0.64]), "Z")]
 )
 def test_the_stage_rotates_up_to_its_up_axis(pxr, tmp_path, up, axis):
-    stage = write_and_open_stage(pxr, tmp_path, random_splats(5), Hints(up), meters_per_unit=0.25)
-    assert (stage.GetMetadata("upAxis"), stage.GetMetadata("metersPerUnit")) == (axis, 0.25)
+    stage = write_and_open_stage(pxr, tmp_path, random_splats(5), Hints(up))
+    assert (stage.GetMetadata("upAxis"), stage.GetMetadata("metersPerUnit")) == (axis, 1.0)
     world = pxr("UsdGeom").Xformable(stage.GetDefaultPrim())
     turned = world.GetLocalTransformation().TransformDir(pxr("Gf").Vec3d(*up))
     np.testing.assert_allclose(turned, (0, 1, 0) if axis == "Y" else (0, 0, 1), atol=1e-12)
