@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Container
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -25,6 +25,11 @@ _MIN_SET_LUMINANCE = 0.02  # a set with a lower median of the mean luminances is
 _DARK_PHOTO_STOPS = 3.0  # a photo this far below the median of its set is dark
 _MAX_CLIPPED_PIXEL_RATIO = 0.25
 _SAME_ZOOM_TOLERANCE = 0.03  # EXIF rounds focal lengths by up to this ratio
+# Files of the same size are compared by so many bytes at their start and from their middle on. Those that agree are
+# compared as a whole, which takes minutes if all photos of a large set are there twice; then further ones count as
+# copies without it.
+_SAMPLE_BYTES = 1 << 16
+_MAX_HASHED_PHOTOS = 100
 _SAME_PICTURE_MAX_LEVELS = 1.0  # thumbnails of the same picture differ by less, in levels of 255 on average
 
 
@@ -67,24 +72,29 @@ def find_copy_problems(
     thumbnails = np.stack([measurement.thumbnail for measurement in measurements])
     if len(measurements) > 2 and np.abs(thumbnails - thumbnails[0]).mean(axis=(1, 2)).max() < _SAME_PICTURE_MAX_LEVELS:
         return ["all photos show the same picture; walk around and take photos from many places"]
-    sizes: dict[int, list[Path]] = {}
-    for photo in photos:
-        if relative_name(photo, folder) not in unreadable:
-            with suppress(OSError):  # of large sets, some photos have not been opened before
-                sizes.setdefault(photo.stat().st_size, []).append(photo)
-    seen: dict[bytes, Path] = {}
-    copies = []
-    suspects = [item for group in sizes.values() if len(group) > 1 for item in group]
-    for done, photo in enumerate(suspects):
-        compared = f"searching for identical photos {done + 1}/{len(suspects)}"
-        report_progress(TaskEvent(compared, PIXELS_PROGRESS + (1 - PIXELS_PROGRESS) * done / len(suspects)))
-        try:
-            digest = hashlib.sha256(photo.read_bytes()).digest()
-        except OSError:
-            continue
-        if digest in seen:
-            copies.append((photo, seen[digest]))
-        seen.setdefault(digest, photo)
+    readable = [photo for photo in photos if relative_name(photo, folder) not in unreadable]
+    same_size = [group for group in _group_files(readable, lambda photo: photo.stat().st_size) if len(group) > 1]
+    middle = (PIXELS_PROGRESS + 1) / 2
+
+    def follow(files: list[Path], start: float, end: float) -> Iterator[Path]:
+        for done, file in enumerate(files):
+            compared = f"searching for identical photos {done + 1}/{len(files)}"
+            report_progress(TaskEvent(compared, start + (end - start) * done / len(files)))
+            yield file
+
+    same_samples = _group_files(
+        follow([photo for group in same_size for photo in group], PIXELS_PROGRESS, middle),
+        lambda photo: (photo.stat().st_size, _digest_samples(photo)),
+    )
+    to_hash: list[Path] = []
+    not_hashed: list[list[Path]] = []
+    for group in same_samples:
+        if len(group) > 1 and len(to_hash) + len(group) <= _MAX_HASHED_PHOTOS:
+            to_hash += group
+        else:
+            not_hashed.append(group)
+    hashed = _group_files(follow(to_hash, middle, 1.0), lambda photo: hashlib.sha256(photo.read_bytes()).digest())
+    copies = [(photo, first) for first, *others in hashed + not_hashed for photo in others]
     if not copies:
         return []
     first, of = (relative_name(item, folder) for item in copies[0])
@@ -92,6 +102,23 @@ def find_copy_problems(
         f"{format_count(len(copies), 'photo is', 'photos are')} a copy of another (such as {first} of {of}); "
         "remove the copies"
     ]
+
+
+def _group_files(files: Iterable[Path], describe: Callable[[Path], Hashable]) -> list[list[Path]]:
+    """Group the files that `describe` gives the same value, and leave out those that cannot be read."""
+    groups: dict[Hashable, list[Path]] = {}
+    for file in files:
+        with suppress(OSError):  # of large sets, some photos have not been opened before
+            groups.setdefault(describe(file), []).append(file)
+    return list(groups.values())
+
+
+def _digest_samples(file: Path) -> bytes:
+    """Return a digest of the first bytes of a file and of those from its middle on."""
+    with file.open("rb") as opened:
+        start = opened.read(_SAMPLE_BYTES)
+        opened.seek(file.stat().st_size // 2)
+        return hashlib.sha256(start + opened.read(_SAMPLE_BYTES)).digest()
 
 
 def find_blur_problems(measurements: list[PhotoMeasurement], blurred: list[Path], folder: Path) -> list[str]:

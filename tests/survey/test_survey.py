@@ -99,6 +99,24 @@ def test_unreadable_photos_are_not_called_copies(photos):
     assert not any("copy of another" in sentence for sentence in survey.problems)
 
 
+def test_files_that_differ_only_between_the_compared_samples_are_not_called_copies(photos):
+    for number, name in enumerate(("001.jpg", "002.jpg", "003.jpg")):
+        data = bytearray((photos / "001.jpg").read_bytes().ljust(400_000, b"\0"))
+        data[100_000] = number // 2  # between the sample at the start and that in the middle
+        (photos / name).write_bytes(data)
+    assert "002.jpg of 001.jpg" in find_problem(describe_photos(photos), "1 photo is a copy")
+
+
+def test_of_large_sets_few_photos_are_read_whole_to_find_copies(photos, monkeypatch):
+    for name in ("001", "002", "003"):
+        shutil.copy(photos / f"{name}.jpg", photos / f"{name} (1).jpg")
+    read_bytes, read = Path.read_bytes, []
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path.name) or read_bytes(path))
+    monkeypatch.setattr("hyrfpack.survey.problems._MAX_HASHED_PHOTOS", 5)
+    assert "3 photos are a copy" in find_problem(describe_photos(photos), "3 photos are a copy")
+    assert read == ["001 (1).jpg", "001.jpg", "002 (1).jpg", "002.jpg"]
+
+
 def test_photos_that_become_unreadable_do_not_end_the_search_for_copies(photos, monkeypatch):
     shutil.copy(photos / "001.jpg", photos / "001 (1).jpg")
     shutil.copy(photos / "002.jpg", photos / "002 (1).jpg")
