@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable
 
 import torch
 
@@ -57,6 +58,9 @@ class LevelRenderer:
         self.choices: list[LevelSelection] = []
         self._device, self._precision = device, precision
         self._chunks: OrderedDict[tuple[int, int], HybridModel] = OrderedDict()
+        # The model of the last view with its levels, and its renderer, because neighbouring views often have the same.
+        self._last: tuple[list[int | None], HybridModel | MergedModel] | None = None
+        self._last_renderer: tuple[GeometryConfig, RenderSettings, Callable[[Camera], RenderedPicture]] | None = None
 
     def load(self, camera: Camera) -> tuple[HybridModel | MergedModel, LevelSelection]:
         """Return a model of the levels that are chosen for a view, and the choice.
@@ -66,12 +70,10 @@ class LevelRenderer:
         """
         choice = select_levels(self.scene.manifest, camera, gaussians=self.gaussians, bytes=self.bytes)
         self.choices.append(choice)
-        chunks = [None if level is None else self._chunk(number, level) for number, level in enumerate(choice.levels)]
-        model = self.scene.join(chunks)
-        for part in parts_of(model):
-            part.to(self._device)
-            part.precision = self._precision
-        return model, choice
+        if self._last is None or self._last[0] != choice.levels:
+            self._last = self._last_renderer = None  # frees the memory before the next model is joined
+            self._last = choice.levels, self._join(choice.levels)
+        return self._last[1], choice
 
     def draw(
         self,
@@ -81,7 +83,19 @@ class LevelRenderer:
         settings: RenderSettings = RenderSettings(),  # noqa: B008 - frozen
     ) -> RenderedPicture:
         """Render a view at the levels that are chosen for it. The arguments are those of `make_renderer`."""
-        return make_renderer(self.load(camera)[0], geometry=geometry, settings=settings)(camera)
+        model, _ = self.load(camera)
+        last = self._last_renderer
+        if last is None or last[0] is not geometry or last[1] is not settings:
+            last = self._last_renderer = geometry, settings, make_renderer(model, geometry=geometry, settings=settings)
+        return last[2](camera)
+
+    def _join(self, levels: list[int | None]) -> HybridModel | MergedModel:
+        chunks = [None if level is None else self._chunk(number, level) for number, level in enumerate(levels)]
+        model = self.scene.join(chunks)
+        for part in parts_of(model):
+            part.to(self._device)
+            part.precision = self._precision
+        return model
 
     def _chunk(self, number: int, level: int) -> HybridModel:
         key = (number, level)

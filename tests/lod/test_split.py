@@ -32,6 +32,7 @@ from hyrfpack.format.sections import SECTION_CONTENTS
 from hyrfpack.format.shared import CODEC_SHARED
 from hyrfpack.lod import LevelRenderer, split, split_model
 from hyrfpack.lod.errors import ERROR_RADII
+from hyrfpack.model import HybridModel
 from hyrfpack.outputs import indexed_folder
 from hyrfpack.render import render_view
 from tools.safety import minimal_reader
@@ -179,6 +180,22 @@ def test_a_view_with_a_budget_draws_no_more_gaussians(folder, cameras):
 
     assert len(model) == choice.gaussians <= 800
     assert set(choice.levels) == {0, 1}
+
+
+def test_views_with_the_same_levels_share_one_decoded_model(folder, cameras, monkeypatch):
+    scene, joined = SceneFolder(folder), []
+    join = SceneFolder.join
+    monkeypatch.setattr(SceneFolder, "join", lambda self, chunks: joined.append(len(chunks)) or join(self, chunks))
+    decode, decoded = HybridModel.decode, []
+    monkeypatch.setattr(HybridModel, "decode", lambda self: decoded.append(len(self)) or decode(self))
+    renderer = LevelRenderer(scene)
+
+    pictures = [renderer.draw(camera).rgb for camera in (cameras[0], cameras[1], cameras[0])]
+
+    assert len(joined) == len(decoded) == 1 and len(renderer.choices) == 3
+    assert torch.equal(pictures[0], pictures[2]) and not torch.equal(pictures[0], pictures[1])
+    renderer.gaussians = 800
+    assert torch.equal(renderer.draw(cameras[0]).rgb, LevelRenderer(scene, gaussians=800).draw(cameras[0]).rgb)
 
 
 def test_a_budget_below_the_coarsest_levels_leaves_chunks_out(folder, cameras):
