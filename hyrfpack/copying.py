@@ -23,8 +23,11 @@ def copy_file(source: Path, target: Path, *, keep_metadata: bool = False) -> Non
 
     Raises:
         OSError: the source cannot be read, or the target cannot be written.
+        shutil.SameFileError: both paths lead to the same file, which stays as it is.
     """
     source = Path(os.path.realpath(source))
+    if target.exists() and source.samefile(target):
+        raise shutil.SameFileError(f"{source} and {target} are the same file")
     if not _reflink(source, target):
         shutil.copyfile(source, target)
     if keep_metadata:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import time
 from pathlib import Path
 
@@ -129,6 +130,15 @@ def test_copies_are_reflinks_where_the_file_system_has_them(tmp_path, monkeypatc
     copy_file(tmp_path / "a.jpg", tmp_path / "b.jpg")
     assert (tmp_path / "b.jpg").read_bytes() == b"photo"
     assert asked == [0x40049409]  # FICLONE of linux/fs.h: _IOW(0x94, 9, int)
+
+
+def test_a_file_that_would_be_copied_onto_itself_is_left_as_it_is(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(b"photo")
+    (tmp_path / "link.jpg").symlink_to(tmp_path / "a.jpg")
+    for target in ("a.jpg", "link.jpg"):
+        with pytest.raises(shutil.SameFileError):
+            copy_file(tmp_path / "a.jpg", tmp_path / target)
+    assert (tmp_path / "a.jpg").read_bytes() == b"photo"
 
 
 def test_a_photo_with_only_a_complete_header_is_omitted_also_as_a_panorama(tmp_path):
