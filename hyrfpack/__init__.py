@@ -211,9 +211,7 @@ if not TYPE_CHECKING:  # Type checkers read the imports above, so that they repo
                 value = getattr(import_module(_MODULES_BY_PUBLIC_NAME[name]), name)
             globals()[name] = value
             return value
-        hint = (
-            f"; the function is now hyrfpack.{_NEW_NAMES_BY_OLD_NAME[name]}" if name in _NEW_NAMES_BY_OLD_NAME else ""
-        )
+        hint = f"; the name is now hyrfpack.{_NEW_NAMES_BY_OLD_NAME[name]}" if name in _NEW_NAMES_BY_OLD_NAME else ""
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'{hint}")
 
 

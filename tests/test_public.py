@@ -125,11 +125,11 @@ def test_sub_packages_support_every_form_of_import():
     assert run_in_new_interpreter(code).stdout == "and nothing else\n", run_in_new_interpreter(code).stderr
 
 
-def test_a_former_function_name_raises_an_error_with_the_present_name():
-    with pytest.raises(AttributeError, match="the function is now hyrfpack.load_model"):
+def test_a_former_name_raises_an_error_with_the_present_name():
+    with pytest.raises(AttributeError, match="the name is now hyrfpack.load_model"):
         _ = hyrfpack.load
     stderr = run_in_new_interpreter("import hyrfpack\nhyrfpack.train()").stderr
-    assert "AttributeError" in stderr and "the function is now hyrfpack.train_model" in stderr
+    assert "AttributeError" in stderr and "the name is now hyrfpack.train_model" in stderr
 
 
 # A mistaken call, and its error message.
