@@ -6,11 +6,13 @@ Settings are written as JSON beside results. JSON cannot represent NumPy's numbe
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Collection
 from typing import Any
 
 MAX_FLOAT = sys.float_info.max
+_CONTROL_CHARACTERS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def check_int(name: str, value: Any, minimum: int, maximum: int | None = None) -> None:
@@ -57,6 +59,34 @@ def check_bool(name: str, value: Any) -> None:
     """
     if not isinstance(value, bool):
         raise ValueError(f"{name} is {value!r}; it must be True or False")
+
+
+def check_text(name: str, value: Any, max_length: int) -> None:
+    """Check that a value is a text of one line, of at most `max_length` characters, none of them a control character.
+
+    Raises:
+        ValueError: the check fails.
+    """
+    if isinstance(value, str) and len(value) <= max_length and not has_control_characters(value):
+        return
+    raise ValueError(
+        f"{name} is {value!r:.80}; it must be a text of at most {max_length:,} characters without control characters"
+    )
+
+
+def has_control_characters(text: str) -> bool:
+    """Return whether a text holds a control character, a line or paragraph separator, or half of a surrogate pair.
+
+    Example:
+        >>> has_control_characters("two\\nlines"), has_control_characters("12\\u00a0m, caf\\u00e9")
+        (True, False)
+    """
+    return _CONTROL_CHARACTERS.search(text) is not None
+
+
+def remove_control_characters(text: str) -> str:
+    """Return a text without the characters that `has_control_characters` finds."""
+    return _CONTROL_CHARACTERS.sub("", text)
 
 
 def check_choice(name: str, value: Any, choices: Collection[str]) -> None:

@@ -9,7 +9,7 @@ import click
 
 from hyrfpack.cli.types import SIZE, reject_non_finite
 from hyrfpack.cli.wording import option_of_argument, use_option_names
-from hyrfpack.config.settings import OneOf, Range, Setting, list_settings
+from hyrfpack.config.settings import OneLine, OneOf, Range, Setting, list_settings
 
 Command = TypeVar("Command", bound=Callable)
 
@@ -61,9 +61,22 @@ def _make_option(setting: Setting) -> Callable[[Command], Command]:
         metavar=metavar,
         default=setting.default,
         show_default=setting.default is not None,
-        callback=reject_non_finite if setting.kind is float else None,
+        callback=_choose_callback(setting),
         help=f"{help}  [default: {default}]" if default else help,
     )
+
+
+def _choose_callback(setting: Setting) -> Callable[..., Any] | None:
+    """Return what checks a value that the option's type accepts, if anything does."""
+
+    def check(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
+        try:
+            setting.check(value)
+        except ValueError as error:
+            raise click.BadParameter(str(error), ctx, param) from error
+        return value
+
+    return reject_non_finite if setting.kind is float else check if isinstance(setting.limits, OneLine) else None
 
 
 def _parameter_type(setting: Setting) -> tuple[click.ParamType, str | None]:

@@ -27,7 +27,7 @@ from dataclasses import dataclass, fields
 from functools import cache
 from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
-from hyrfpack.checks import MAX_FLOAT, check_bool, check_choice, check_float, check_int
+from hyrfpack.checks import MAX_FLOAT, check_bool, check_choice, check_float, check_int, check_text
 
 LARGEST_SEED = 2**64 - 1  # torch's generators take seeds of 64 bits.
 _ENTRY_PATTERN = re.compile(r"(?m)^    (\w+(?:, \w+)*):((?:.|\n {5,})+)")
@@ -53,6 +53,13 @@ class OneOf:
     words: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class OneLine:
+    """Texts of one line, of at most `max_length` characters, none of them a control character."""
+
+    max_length: int
+
+
 Seed = Annotated[int, Range(0, LARGEST_SEED)]
 
 
@@ -65,7 +72,7 @@ class Setting:
         kind: type of the values: int, float, bool or str.
         optional: whether the value may be None.
         default: value of the field if none is given.
-        limits: the allowed numbers or words; None for bool, and for str if any is allowed.
+        limits: the allowed numbers, words or texts; None for bool, and for str if any is allowed.
         description: description from the docstring of the class, beginning with a capital letter.
         default_description: what None means, after "Default:" in the docstring; "" if that is not described.
     """
@@ -74,7 +81,7 @@ class Setting:
     kind: type
     optional: bool
     default: Any
-    limits: Range | OneOf | None
+    limits: Range | OneOf | OneLine | None
     description: str
     default_description: str
 
@@ -92,6 +99,8 @@ class Setting:
             raise ValueError(f"{self.name} is {value!r}; it must be a string")
         elif isinstance(self.limits, OneOf):
             check_choice(self.name, value, self.limits.words)
+        elif isinstance(self.limits, OneLine):
+            check_text(self.name, value, self.limits.max_length)
         elif isinstance(self.limits, Range) and self.kind is int:
             check_int(self.name, value, *self.limits.as_ints())
         elif isinstance(self.limits, Range):
@@ -115,7 +124,7 @@ def list_settings(config_class: type) -> dict[str, Setting]:
         optional, kinds = type(None) in members, [member for member in members if member is not type(None)]
         if len(kinds) != 1 or kinds[0] not in (int, float, bool, str):
             continue
-        limits = next((extra for extra in extras if isinstance(extra, Range | OneOf)), None)
+        limits = next((extra for extra in extras if isinstance(extra, Range | OneOf | OneLine)), None)
         entry, _, default_description = entries.get(field.name, "").partition(" Default: ")
         settings[field.name] = Setting(
             field.name,

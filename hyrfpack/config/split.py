@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from hyrfpack.config.settings import Range, Seed, check_settings
+from hyrfpack.config.settings import OneLine, Range, Seed, check_settings
 
 MAX_LEVELS = 8
+MAX_TITLE_LENGTH = 1000  # of each text for people in the manifest
 DEFAULT_CHUNK_GAUSSIANS = 16_384
 
 
@@ -29,8 +30,8 @@ class SplitConfig:
     chunk_gaussians: Annotated[int, Range(64)] = DEFAULT_CHUNK_GAUSSIANS
     levels: Annotated[int, Range(1, MAX_LEVELS)] = 4
     refit_steps: Annotated[int, Range(0)] = 250
-    title: str | None = None
-    licence: str = ""
+    title: Annotated[str | None, OneLine(MAX_TITLE_LENGTH)] = None
+    licence: Annotated[str, OneLine(MAX_TITLE_LENGTH)] = ""
     seed: Seed = 0
 
     def __post_init__(self) -> None:

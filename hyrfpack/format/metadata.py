@@ -79,7 +79,7 @@ class Metadata:
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         if not self.layers:
             del values["layers"]
-        if _is_too_deep(values):
+        if is_too_deep(values):
             raise HyrfError(
                 f"the metadata is nested deeper than {MAX_NESTING_DEPTH} levels",
                 fix="flatten the provenance",
@@ -137,7 +137,7 @@ def read_metadata(container: Container) -> Metadata:
         ) from error
     if not isinstance(values, dict):
         raise HyrfFormatError(f"{name}: the metadata is not a JSON object", fix="write the file again")
-    if _is_too_deep(values):
+    if is_too_deep(values):
         raise HyrfFormatError(
             f"{name}: the metadata is nested deeper than {MAX_NESTING_DEPTH} levels",
             fix="write the file again",
@@ -200,7 +200,7 @@ def _check_type(value: Any, kind: type | tuple | dict, path: str) -> None:
         raise ValueError(f"'{path}' must be of type {kind.__name__}")
 
 
-def _is_too_deep(value: object) -> bool:
+def is_too_deep(value: object) -> bool:
     """Return whether objects and lists are nested deeper than MAX_NESTING_DEPTH.
 
     It works level by level instead of by recursion, so that no depth overflows the stack.

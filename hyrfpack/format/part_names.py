@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Sequence
 
+from hyrfpack.checks import has_control_characters, remove_control_characters
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import Container, Section, raw_bytes_limit, read_container
 from hyrfpack.format.sections import MAX_PARTS, PART_NAMES, SECTION_CONTENTS, part_section
@@ -16,7 +16,6 @@ CODEC_NAMES = 0
 CODEC_FILE = 10
 MAX_NAME_LENGTH = 64
 MAX_NAMES_BYTES = 1 << 16
-_CONTROL_CHARACTERS = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def check_part_names(names: Sequence[object]) -> None:
@@ -27,7 +26,7 @@ def check_part_names(names: Sequence[object]) -> None:
     if not 1 <= len(names) <= MAX_PARTS:
         raise ValueError(f"there are {len(names)} parts; a file holds 1 to {MAX_PARTS}")
     for name in names:
-        if not isinstance(name, str) or not 1 <= len(name) <= MAX_NAME_LENGTH or _CONTROL_CHARACTERS.search(name):
+        if not isinstance(name, str) or not 1 <= len(name) <= MAX_NAME_LENGTH or has_control_characters(name):
             raise ValueError(
                 f"{name!r:.80} is no name of a part, which has 1 to {MAX_NAME_LENGTH} characters, none "
                 "of them a control character"
@@ -67,7 +66,7 @@ def read_part_names(container: Container) -> list[str]:
 
 def printable_name(name: str) -> str:
     """Return a text without control characters, cut to fit into a name of a part with a number after it."""
-    return _CONTROL_CHARACTERS.sub("", name)[: MAX_NAME_LENGTH - 3] or "part"
+    return remove_control_characters(name)[: MAX_NAME_LENGTH - 3] or "part"
 
 
 def reject_constant(name: str) -> None:

@@ -14,9 +14,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from hyrfpack.config.split import MAX_LEVELS
+from hyrfpack.checks import check_text
+from hyrfpack.config.split import MAX_LEVELS, MAX_TITLE_LENGTH
 from hyrfpack.errors import HyrfFormatError
-from hyrfpack.format.metadata import writer_name
+from hyrfpack.format.container import MAX_FILE_BYTES
+from hyrfpack.format.metadata import MAX_NESTING_DEPTH, is_too_deep, writer_name
 from hyrfpack.format.part_names import ONE_PART_NAME, check_part_names, reject_constant
 from hyrfpack.format.run_folder import SCENE_MANIFEST_FILE as MANIFEST_NAME
 from hyrfpack.format.sections import MAX_PARTS
@@ -28,8 +30,7 @@ ONE_PART_VERSION, PARTS_VERSION = (1, 0), (2, 0)
 MAX_MANIFEST_BYTES = 1 << 24
 MAX_CHUNKS = 1 << 16
 MAX_ERROR_RADII = 16
-MAX_TEXT_LENGTH = 1000
-_INTEGER_LIMIT = 1 << 40
+_MAX_INTEGER = (1 << 40) - 1
 _CHECKSUM_PATTERN = re.compile(r"[0-9a-f]{8}")
 _VERSION_PATTERN = re.compile(r"(\d{1,4})\.(\d{1,4})")
 
@@ -181,6 +182,8 @@ def parse_manifest(data: bytes, name: str = MANIFEST_NAME) -> Manifest:
         values = json.loads(data.decode("utf-8"), parse_constant=reject_constant)
         if not isinstance(values, dict) or values.get("format") != FORMAT_NAME:
             raise HyrfFormatError(f"{name}: this is not the manifest of a scene folder", fix="check the path")
+        if is_too_deep(values):
+            raise ValueError(f"it is nested deeper than {MAX_NESTING_DEPTH} levels")
         return _parse_values(values, _read_major_version(values.get("version"), name))
     # Deep nesting overflows the parser's stack, and Python converts no integer of 5,000 digits (ValueError).
     except (ValueError, RecursionError) as error:
@@ -267,7 +270,7 @@ def _file_values(values: Mapping[str, Any]) -> dict[str, Any]:
         raise ValueError(f"{name!r:.80} is not the name of a .hyrf file in the folder")
     if not isinstance(checksum, str) or not _CHECKSUM_PATTERN.fullmatch(checksum):
         raise ValueError(f"the checksum of {name} is not 8 hexadecimal digits")
-    return {"file": name, "bytes": _integer(values, "bytes"), "crc32": checksum}
+    return {"file": name, "bytes": _integer(values, "bytes", MAX_FILE_BYTES), "crc32": checksum}
 
 
 def _typed(values: Mapping[str, Any], key: str, kind: type) -> Any:
@@ -290,14 +293,13 @@ def _list(values: Mapping[str, Any], key: str, lengths: range) -> list[Any]:
 
 def _text(values: Mapping[str, Any], key: str) -> str:
     text = _typed(values, key, str)
-    if len(text) > MAX_TEXT_LENGTH or not text.isprintable():
-        raise ValueError(f"'{key}' is longer than {MAX_TEXT_LENGTH} characters or holds a control character")
+    check_text(f"'{key}'", text, MAX_TITLE_LENGTH)
     return text
 
 
-def _integer(values: Mapping[str, Any], key: str) -> int:
+def _integer(values: Mapping[str, Any], key: str, maximum: int = _MAX_INTEGER) -> int:
     value = _typed(values, key, int)
-    if not 0 <= value < _INTEGER_LIMIT:
+    if not 0 <= value <= maximum:
         raise ValueError(f"'{key}' is out of range")
     return value
 

@@ -15,8 +15,8 @@ import torch
 from hyrfpack.cameras.capture import MIN_COARSE_CAMERAS, Capture
 from hyrfpack.cameras.files import camera_to_numbers
 from hyrfpack.cameras.view_sampling import resize_camera, sample_views
-from hyrfpack.checks import check_type
-from hyrfpack.config.split import SplitConfig
+from hyrfpack.checks import check_type, remove_control_characters
+from hyrfpack.config.split import MAX_TITLE_LENGTH, SplitConfig
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format.container import Container, read_container
@@ -26,7 +26,7 @@ from hyrfpack.format.part_names import ONE_PART_NAME, list_parts
 from hyrfpack.format.parts import decode_parts
 from hyrfpack.format.run_folder import find_model, name_model
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
-from hyrfpack.format.scene_manifest import MANIFEST_NAME, Chunk, ChunkLevel, Manifest, ScenePart
+from hyrfpack.format.scene_manifest import MANIFEST_NAME, Chunk, ChunkLevel, Manifest, ScenePart, parse_manifest
 from hyrfpack.format.scene_model import join_parts
 from hyrfpack.format.sections import SECTION_CONTENTS
 from hyrfpack.lock import exclusive_folder
@@ -111,7 +111,7 @@ def split_model(
         context: how progress is shown.
 
     Raises:
-        HyrfError: the file cannot be read or holds no Gaussian, or the folder cannot be written.
+        HyrfError: the file cannot be read or holds no Gaussian, or the folder cannot be written or would be too large.
         TypeError: `config` is not a SplitConfig, or `data` is not a Scene.
 
     Example:
@@ -134,6 +134,7 @@ def split_model(
         Outputs(path, scene=data, overwrite=overwrite).folder(target, [MANIFEST_NAME, *shared_names])
         files, manifest = _split(path, shared_names, name_model(source), config, data, progress)
         Outputs(path, scene=data, overwrite=overwrite).folder(target, files)
+        _check_manifest(manifest, target / MANIFEST_NAME)
         _write_folder(target, files, manifest, overwrite)
     levels = list(zip(*(chunk.levels for chunk in manifest.chunks), strict=True))
     level_bytes = [sum(item.bytes for item in level) for level in levels]
@@ -342,9 +343,19 @@ def _make_manifest(
         solid=tuple(values["solid"]),
         viewpoint=capture.viewpoint.to_json(rounded=True),
         cameras=tuple(tuple(camera_to_numbers(camera)) for camera in cameras),
-        title=name if config.title is None else config.title,
+        title=remove_control_characters(name)[:MAX_TITLE_LENGTH] if config.title is None else config.title,
         licence=config.licence,
     )
+
+
+def _check_manifest(manifest: Manifest, path: Path) -> None:
+    """Raise HyrfError unless readers will accept the manifest; its size and its number of chunks are limited."""
+    try:
+        parse_manifest(manifest.to_json(), str(path))
+    except HyrfFormatError as error:
+        raise HyrfError(
+            error.problem, fix="split into fewer chunks with a larger `chunk_gaussians`, or into fewer `levels`"
+        ) from error
 
 
 def _write_folder(folder: Path, files: dict[str, bytes], manifest: Manifest, overwrite: bool) -> None:

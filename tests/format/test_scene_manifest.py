@@ -68,6 +68,24 @@ def test_a_manifest_is_read_as_it_was_written_and_matches_the_schema(manifest, v
     assert values["version"] == version and matches(values, MANIFEST_SCHEMA)
 
 
+@pytest.mark.parametrize("text", ["12\u00a0m", "\u4eac\u90fd\u3000\u5bfa", "\U0001f469\u200d\U0001f52c", "x" * 1000])
+def test_texts_without_control_characters_are_read_as_they_were_written(text):
+    manifest = replace(VALID_MANIFEST, title=text, licence=text)
+
+    assert parse_manifest(manifest.to_json()) == manifest
+
+
+def test_a_manifest_is_nested_as_deep_as_a_file_may_be():
+    def nested(depth: int) -> Any:
+        return {} if depth == 0 else {"a": nested(depth - 1)}
+
+    parse_manifest(with_value(["frame"], nested(62)))
+    for key in ("frame", "viewpoint", "unknown"):
+        for depth in (63, 64, 700):
+            with pytest.raises(HyrfFormatError, match="nested deeper than 64 levels"):
+                parse_manifest(with_value([key], nested(depth)))
+
+
 def test_a_manifest_of_one_part_has_the_keys_of_version_1_alone():
     values = json.loads(VALID_MANIFEST.to_json())
 
@@ -116,6 +134,7 @@ def test_a_name_that_leads_out_of_the_folder_is_refused(name):
         (["gaussians"], 8, "do not add up to 8"),
         (["gaussians"], True, "'gaussians' must be of type int"),
         (["shared", "bytes"], -1, "'bytes' is out of range"),
+        (["shared", "bytes"], 2**34 + 1, "'bytes' is out of range"),
         (["shared", "crc32"], "XYZ", "not 8 hexadecimal digits"),
         (["chunks", 1, "levels", 0, "file"], "Shared.hyrf", "two files are named 'shared.hyrf'"),
         (["chunks", 0, "levels"], [], "'levels' has 0 entries"),
@@ -125,6 +144,8 @@ def test_a_name_that_leads_out_of_the_folder_is_refused(name):
         (["error_radii"], [64, 16], "do not rise"),
         (["error_radii"], [10**400, 16], "out of range"),
         (["title"], "two\nlines", "control character"),
+        (["title"], "\ud83d", "control character"),
+        (["licence"], "x" * 1001, "at most 1,000 characters"),
     ],
 )
 def test_a_manifest_with_an_impossible_value_is_refused(path, value, problem):

@@ -243,6 +243,40 @@ def test_levels_are_fitted_and_measured_at_the_cameras_of_the_photos(tmp_path, m
         split_model(COMPACT_FILE, tmp_path / "scene", config, data=photographed, context=QUIET_CONTEXT)
 
 
+@pytest.mark.parametrize(
+    ("name", "title", "licence", "expected"),
+    [
+        ("12\u00a0m", None, "CC\u00a0BY", "12\u00a0m"),
+        ("two\u2028lines", None, "", "twolines"),
+        ("model", "\U0001f469\u200d\U0001f52c", "", "\U0001f469\u200d\U0001f52c"),
+    ],
+)
+def test_the_manifest_of_any_title_is_read_again(tmp_path, name, title, licence, expected):
+    source = tmp_path / f"{name}.hyrf"
+    shutil.copy(RAW_FILE, source)
+    config = SplitConfig(levels=1, title=title, licence=licence)
+
+    split_model(source, tmp_path / "scene", config, context=QUIET_CONTEXT)
+
+    manifest = SceneFolder(tmp_path / "scene").manifest
+    assert (manifest.title, manifest.licence) == (expected, licence)
+
+
+@pytest.mark.parametrize("text", ["two\nlines", "x" * 1001, "\ud83d"])
+def test_texts_that_a_manifest_cannot_hold_are_refused_before_the_work(text, tmp_path):
+    for key in ("title", "licence"):
+        with pytest.raises(ValueError, match=f"{key} is .*at most 1,000 characters without control characters"):
+            SplitConfig(**{key: text})
+    assert "without control characters" in refused("split", RAW_FILE, "-o", tmp_path / "scene", "--title", "a\nb")
+
+
+def test_a_manifest_that_readers_would_refuse_is_not_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(scene_manifest, "MAX_CHUNKS", 2)
+    with pytest.raises(HyrfError, match=r"'chunks' has 4 entries.*`chunk_gaussians`"):
+        split_model(RAW_FILE, tmp_path / "scene", SplitConfig(chunk_gaussians=400, levels=1), context=QUIET_CONTEXT)
+    assert not (tmp_path / "scene").exists()
+
+
 def test_a_zip_of_the_folder_is_read_like_the_folder(folder, tmp_path):
     archive = shutil.make_archive(str(tmp_path / "scene"), "zip", folder.parent, folder.name)
 
