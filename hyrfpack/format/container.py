@@ -158,14 +158,7 @@ class Container:
                 fix="join it with 'hyrfpack decompress' first",
             )
         try:
-            # The mode is checked before opening, because opening a named pipe would wait for a writer.
-            mode = os.stat(path).st_mode
-            if not stat.S_ISREG(mode):
-                raise HyrfFormatError(
-                    f"{name}: this is not a regular file",
-                    fix="copy its content to a .hyrf file first",
-                )
-            file = open(path, "rb")
+            file = open_regular_file(path)
         except (OSError, ValueError) as error:
             raise _unreadable_error(name, error) from error
         try:
@@ -419,6 +412,20 @@ def read_container(
     """
     view = _as_bytes(data).toreadonly()
     return Container(lambda offset, count: view[offset : offset + count], len(view), known, name, fraction)
+
+
+def open_regular_file(path: os.PathLike[str]) -> BinaryIO:
+    """Open a file for reading.
+
+    Raises:
+        HyrfFormatError: it is a named pipe, a device or another special file.
+        OSError: the system cannot open it.
+        ValueError: the path holds a NUL character.
+    """
+    # The mode is checked before opening, because opening a named pipe would wait for a writer.
+    if not stat.S_ISREG(os.stat(path).st_mode):
+        raise HyrfFormatError(f"{path}: this is not a regular file", fix="copy its content to a file first")
+    return open(path, "rb")
 
 
 def raw_bytes_limit(file_length: int) -> int:

@@ -9,13 +9,12 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hyrfpack.errors import HyrfFormatError
-from hyrfpack.format.container import Container, read_container
+from hyrfpack.errors import HyrfFormatError, short_reason
+from hyrfpack.format.container import Container, open_regular_file, raw_bytes_limit, read_container
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.run_folder import name_model
 from hyrfpack.format.scene_manifest import (
@@ -47,56 +46,73 @@ def is_scene(path: StrPath) -> bool:
     if not (path.is_dir() or path.name == MANIFEST_NAME or _is_zip(path)):
         return False
     try:  # Other programs write files of this name, too.
-        return FORMAT_NAME.encode() in _SceneFiles.of(path).read(MANIFEST_NAME, MAX_MANIFEST_BYTES)
+        return FORMAT_NAME.encode() in _SceneFiles(path).read(MANIFEST_NAME, MAX_MANIFEST_BYTES)
     except HyrfFormatError:
         return False
 
 
-@dataclass(frozen=True)
 class _SceneFiles:
-    """The files of a scene, in a folder or in a .zip.
+    """The files of a scene, in a folder or in a .zip; several threads may read them.
 
     Attributes:
         path: the folder or the .zip.
-        prefix: the folder within the .zip, "" or "name/"; None for a folder.
+        is_folder: whether the files lie in a folder.
     """
 
-    path: Path
-    prefix: str | None
-
-    @classmethod
-    def of(cls, path: Path) -> _SceneFiles:
-        """Return the files of a scene folder, of the folder of a manifest, or of a .zip."""
+    def __init__(self, path: Path) -> None:
+        """Find the files of a scene folder, of the folder of a manifest, or of a .zip, which stays open."""
+        self._archive: zipfile.ZipFile | None = None
+        self._prefix = ""  # the folder within the .zip, "" or "name/"
         if _is_zip(path):
-            return cls(path, _find_prefix(path))
-        return cls(path.parent if path.name == MANIFEST_NAME and not path.is_dir() else path, None)
+            self.path = path
+            with _naming_errors(path):
+                self._archive = zipfile.ZipFile(path)
+                self._prefix = _find_prefix(self._archive)
+        else:
+            self.path = path.parent if path.name == MANIFEST_NAME and not path.is_dir() else path
+
+    @property
+    def is_folder(self) -> bool:
+        return self._archive is None
 
     def read(self, name: str, limit: int) -> bytes:
-        """Return the bytes of a file, at most `limit` and one more."""
-        try:
-            if self.prefix is None:
-                with open(self.path / name, "rb") as file:
+        """Return the bytes of a file, at most `limit` and one more; nothing is read of a file that unpacks to more."""
+        with _naming_errors(self.path / name):
+            if self._archive is None:
+                with open_regular_file(self.path / name) as file:
                     return file.read(limit + 1)
-            with zipfile.ZipFile(self.path) as archive, archive.open(self.prefix + name) as member:
+            info = self._archive.getinfo(self._prefix + name)
+            # An archive may declare any size, and some of its codecs shrink zeros without limit.
+            allowed = raw_bytes_limit(info.compress_size)
+            if info.file_size > allowed:
+                raise HyrfFormatError(
+                    f"{self.path / name}: its {info.compress_size:,} bytes would unpack to {info.file_size:,}, more "
+                    f"than {allowed:,}",
+                    fix=COPY_AGAIN,
+                )
+            with self._archive.open(info) as member:
                 return member.read(limit + 1)
-        except (OSError, KeyError, zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError) as error:
-            raise self._unreadable_error(name, error) from error
 
     def size(self, name: str) -> int:
         """Return the size of a file."""
-        try:
-            if self.prefix is None:
+        with _naming_errors(self.path / name):
+            if self._archive is None:
                 return os.stat(self.path / name).st_size
-            with zipfile.ZipFile(self.path) as archive:
-                return archive.getinfo(self.prefix + name).file_size
-        except (OSError, KeyError, zipfile.BadZipFile) as error:
-            raise self._unreadable_error(name, error) from error
+            return self._archive.getinfo(self._prefix + name).file_size
 
-    def _unreadable_error(self, name: str, error: Exception) -> HyrfFormatError:
-        if isinstance(error, (FileNotFoundError, KeyError, NotADirectoryError)):
-            return HyrfFormatError(f"{self.path / name}: this file of the scene is missing", fix=COPY_AGAIN)
-        reason = getattr(error, "strerror", None) or error
-        return HyrfFormatError(f"{self.path / name}: the file cannot be read ({reason})", fix=COPY_AGAIN)
+
+@contextmanager
+def _naming_errors(path: Path) -> Iterator[None]:
+    """Turn whatever is raised where a file is opened, read or unpacked into a HyrfFormatError that names the file."""
+    try:
+        yield
+    except HyrfFormatError:
+        raise
+    except (FileNotFoundError, KeyError, NotADirectoryError) as error:
+        raise HyrfFormatError(f"{path}: this file of the scene is missing", fix=COPY_AGAIN) from error
+    except Exception as error:  # zipfile and its decompressors raise exceptions of many types
+        reason = getattr(error, "strerror", None) or short_reason(error)
+        raise HyrfFormatError(f"{path}: the file cannot be read ({reason})", fix=COPY_AGAIN) from error
 
 
 class SceneFolder:
@@ -120,7 +136,7 @@ class SceneFolder:
         Raises:
             HyrfFormatError: there is no manifest, or it is damaged or of another version.
         """
-        self._files = _SceneFiles.of(Path(path))
+        self._files = _SceneFiles(Path(path))
         self.path = self._files.path
         data = self._files.read(MANIFEST_NAME, MAX_MANIFEST_BYTES)
         self.manifest: Manifest = parse_manifest(data, str(self.path / MANIFEST_NAME))
@@ -131,11 +147,9 @@ class SceneFolder:
         Raises:
             HyrfFormatError: the file is missing, damaged, or another one than the manifest says.
         """
+        self._check_size(item, self._files.size(item.file))
         name, data = self.path / item.file, self._files.read(item.file, item.bytes)
-        if len(data) != item.bytes:
-            raise HyrfFormatError(
-                f"{name}: the manifest says {item.bytes:,} bytes and there are {len(data):,}", fix=COPY_AGAIN
-            )
+        self._check_size(item, len(data))
         if f"{zlib.crc32(data):08x}" != item.crc32:
             raise HyrfFormatError(f"{name}: its bytes are not those that the manifest lists", fix=COPY_AGAIN)
         return data
@@ -153,16 +167,19 @@ class SceneFolder:
             HyrfFormatError: a file is missing or has another size.
         """
         for item in self.manifest.files:
-            if (size := self._files.size(item.file)) != item.bytes:
-                raise HyrfFormatError(
-                    f"{self.path / item.file}: the manifest says {item.bytes:,} bytes and there are {size:,}",
-                    fix=COPY_AGAIN,
-                )
+            self._check_size(item, self._files.size(item.file))
         listed = {item.file for item in self.manifest.files}
-        extra = sorted({path.name for path in self.path.glob("*.hyrf")} - listed) if self._files.prefix is None else []
+        extra = sorted({path.name for path in self.path.glob("*.hyrf")} - listed) if self._files.is_folder else []
         if extra:
             more = f" and {len(extra) - 1} more" if len(extra) > 1 else ""
             _LOG.warning(f"{self.path / extra[0]}{more}: not in the manifest and ignored")
+
+    def _check_size(self, item: SceneFile, size: int) -> None:
+        if size != item.bytes:
+            raise HyrfFormatError(
+                f"{self.path / item.file}: the manifest says {item.bytes:,} bytes and there are {size:,}",
+                fix=COPY_AGAIN,
+            )
 
     def load(
         self, levels: Sequence[int | None] | None = None, device: str | torch.device = "cpu"
@@ -179,10 +196,10 @@ class SceneFolder:
         from hyrfpack.device import choose_device
         from hyrfpack.model.merged import parts_of
 
+        device = choose_device(device)
         chosen = [0] * len(self.manifest.chunks) if levels is None else levels
         chunks = [None if level is None else self.load_chunk(number, level) for number, level in enumerate(chosen)]
         model = self.join(chunks)
-        device = choose_device(device)
         for part in parts_of(model):
             part.to(device)
         return model
@@ -200,14 +217,18 @@ class SceneFolder:
         return join_parts(names, self.fields, [chunk for chunk, _ in given], [part for _, part in given])
 
     @cached_property
+    def _shared_files(self) -> list[Container]:
+        """The shared file of each part, in memory; all chunks of the part refer to it."""
+        return [self.open_file(part) for part in self.manifest.parts]
+
+    @cached_property
     def fields(self) -> list[HybridModel]:
         """For each part, a model without Gaussians, of the fields and the exposure map that its chunks share."""
         from hyrfpack.format.decode import decode_container
 
         models = []
-        for part in self.manifest.parts:
-            with self.open_file(part) as container:
-                models.append(decode_container(container))
+        for part, container in zip(self.manifest.parts, self._shared_files, strict=True):
+            models.append(decode_container(container))
             if len(models[-1]):
                 raise HyrfFormatError(
                     f"{self.path / part.file}: it holds Gaussians, and should hold only what chunks share",
@@ -217,11 +238,7 @@ class SceneFolder:
 
     def read_provenances(self) -> list[dict]:
         """Return the provenance of each part."""
-        provenances = []
-        for part in self.manifest.parts:
-            with self.open_file(part) as container:
-                provenances.append(read_metadata(container).provenance)
-        return provenances
+        return [read_metadata(container).provenance for container in self._shared_files]
 
     def load_chunk(self, number: int, level: int = 0) -> HybridModel:
         """Return the model of one chunk at a level of detail, whose fields are those of its part.
@@ -236,7 +253,7 @@ class SceneFolder:
 
         def open_shared(name: str) -> Container:
             if name == part.file:
-                return self.open_file(part)
+                return self._shared_files[chunk.part]
             raise HyrfFormatError(
                 f"{self.path / item.file}: it refers to {name}, and the manifest says {part.file}", fix=COPY_AGAIN
             )
@@ -277,11 +294,7 @@ def _is_zip(path: Path) -> bool:
     return path.suffix.lower() == ".zip" and path.is_file()
 
 
-def _find_prefix(path: Path) -> str:
+def _find_prefix(archive: zipfile.ZipFile) -> str:
     """Return the folder in a .zip that holds the manifest, "" or "name/"; "" if there is none."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = [name for name in archive.namelist() if name.rpartition("/")[2] == MANIFEST_NAME]
-    except (OSError, zipfile.BadZipFile):
-        return ""
+    names = [name for name in archive.namelist() if name.rpartition("/")[2] == MANIFEST_NAME]
     return min((name.removesuffix(MANIFEST_NAME) for name in names if name.count("/") <= 1), default="")
