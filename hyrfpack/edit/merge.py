@@ -11,7 +11,7 @@ from hyrfpack.checks import check_several
 from hyrfpack.config.edit import Move
 from hyrfpack.edit.transform import Placement
 from hyrfpack.errors import HyrfError
-from hyrfpack.format.arrays import parse_config
+from hyrfpack.format.arrays import read_config
 from hyrfpack.format.container import Container
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.part_names import open_parts, printable_name
@@ -107,11 +107,10 @@ def merge_models(
                         f"{path}: with it there are more than {MAX_PARTS} parts, which a file cannot hold",
                         fix="merge fewer models",
                     )
-                metadata = read_metadata(part)
-                antialiased[parse_config(metadata.config).antialiased] = str(path)
+                antialiased[read_config(part).antialiased] = str(path)
                 data = _moved_bytes(part, placements[stem]) if stem in placements else self_contained_bytes(part)
                 taken = {other.name for other, _ in parts}
-                merged = MergedPart(_free_name(name, taken), str(path), metadata.gaussians, len(data))
+                merged = MergedPart(_free_name(name, taken), str(path), read_metadata(part).gaussians, len(data))
                 parts.append((merged, data))
     if len(antialiased) > 1:
         raise HyrfError(
@@ -161,8 +160,7 @@ def _check_moves(stems: Sequence[str], moves: Mapping[str, Sequence[Move]]) -> d
 
 def _moved_bytes(part: Container, placement: Placement) -> bytes:
     """Return the bytes of a model that is placed elsewhere; only its metadata differ."""
-    metadata = read_metadata(part)
-    config = parse_config(metadata.config)
+    config = read_config(part)
     moved = replace(config, frame=placement.move_frame(config.frame))
     return with_metadata(part, moved, placement.move_provenance(read_provenance(part)))
 

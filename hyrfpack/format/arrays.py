@@ -10,6 +10,8 @@ import torch
 
 from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import sections
+from hyrfpack.format.container import Container
+from hyrfpack.format.metadata import read_metadata
 from hyrfpack.model import BACKGROUND_RADIUS, DIRECTION_FEATURES
 from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.gaussians import Gaussians
@@ -151,6 +153,20 @@ def check_rules(rules: dict) -> None:
                 f"rule {name!r:.40} is {rules.get(name)!r:.40} and this hyrfpack knows only {MODEL_RULES.get(name)!r}",
                 fix="update hyrfpack",
             )
+
+
+def read_config(container: Container) -> ModelConfig:
+    """Read the configuration of a file's model, after a check of its rules.
+
+    Raises:
+        HyrfFormatError: the metadata is damaged, or asks for another model than this version knows; it names the file.
+    """
+    metadata = read_metadata(container)
+    try:
+        check_rules(metadata.rules)
+        return parse_config(metadata.config)
+    except HyrfFormatError as error:
+        raise error.with_text(f"{container.name}: {error.problem}") from error
 
 
 def parse_config(values: dict) -> ModelConfig:

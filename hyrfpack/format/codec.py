@@ -16,10 +16,10 @@ from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import compact, paper, raw
 from hyrfpack.format.arrays import MODEL_RULES
 from hyrfpack.format.container import Container, Section, raw_bytes_limit, read_container, write_container
-from hyrfpack.format.decode import decode_container, gaussian_limit
+from hyrfpack.format.decode import decode_container
 from hyrfpack.format.exposure import encode_exposure
 from hyrfpack.format.info import FileReport, section_sizes
-from hyrfpack.format.metadata import Metadata, read_metadata
+from hyrfpack.format.metadata import Metadata, gaussian_limit, read_metadata
 from hyrfpack.format.part_names import list_parts
 from hyrfpack.format.parts import write_parts
 from hyrfpack.format.run_folder import find_model
@@ -49,7 +49,8 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
             `quantized` numbers from `hyrfpack.compress.quantize.quantize`; "raw" has none.
 
     Raises:
-        HyrfError: the profile does not exist, or a parameter is NaN, infinite or too large for the profile.
+        HyrfError: the profile does not exist, a parameter is NaN, infinite or too large for the profile, or the
+            provenance is not JSON or too large.
         TypeError: `model` is not a HybridModel.
     """
     check_type("model", model, HybridModel)

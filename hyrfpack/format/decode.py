@@ -12,14 +12,15 @@ import torch
 from hyrfpack.cameras.sampling import PhotoCameras
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import compact, paper, raw
-from hyrfpack.format.arrays import check_rules, group_shapes, layered_groups, parse_config, to_gaussians, to_model
+from hyrfpack.format.arrays import group_shapes, layered_groups, read_config, to_gaussians, to_model
 from hyrfpack.format.container import Container
 from hyrfpack.format.exposure import decode_exposure
-from hyrfpack.format.metadata import read_metadata
+from hyrfpack.format.metadata import gaussian_limit, read_metadata
 from hyrfpack.format.sections import (
     EXPOSURE,
     PART_NAMES,
     POSITIONS,
+    TABLE_SECTIONS,
     group_and_layer,
     layer_section,
 )
@@ -29,9 +30,6 @@ from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.quant import DamagedDataError
 
-# A file may declare this many Gaussians for each of its bytes, plus a constant, because equal Gaussians take no bytes.
-MAX_GAUSSIANS_PER_FILE_BYTE = 32
-EXTRA_GAUSSIANS_PER_FILE = 1 << 18
 # Decoders of the codecs that read no other section; `compact` has those that need the positions.
 DECODER_BY_CODEC = {**raw.DECODER_BY_CODEC, **paper.DECODER_BY_CODEC}
 
@@ -49,11 +47,6 @@ class ModelLayout:
     config: ModelConfig
     layers: list[int]
     shapes: dict[str, tuple[int, int]]
-
-
-def gaussian_limit(file_length: int) -> int:
-    """Return the largest number of Gaussians that a file of `file_length` bytes may hold."""
-    return MAX_GAUSSIANS_PER_FILE_BYTE * file_length + EXTRA_GAUSSIANS_PER_FILE
 
 
 def decode_container(container: Container, fields: HybridModel | None = None) -> HybridModel:
@@ -122,12 +115,7 @@ def read_layout(container: Container) -> ModelLayout:
         HyrfFormatError: a section is missing, has an unknown codec or another size than the metadata asks for, or there
             are more Gaussians than the size of the file allows.
     """
-    name, metadata = container.name, read_metadata(container)
-    try:
-        check_rules(metadata.rules)
-        config = parse_config(metadata.config)
-    except HyrfFormatError as error:
-        raise error.with_text(f"{name}: {error.problem}") from error
+    name, metadata, config = container.name, read_metadata(container), read_config(container)
     layers = metadata.layers or [metadata.gaussians]
     shapes, groups = {}, layered_groups(config)
     for layer, count in enumerate(layers):
@@ -160,8 +148,16 @@ def _check_sections(container: Container, shapes: dict[str, tuple[int, int]]) ->
     for tag, (rows, columns) in shapes.items():
         entry, name = container.entries.get(tag), container.name
         if entry is not None and entry.codec == CODEC_SHARED:
+            if tag not in container:
+                continue  # The reference lies past the available bytes; `read_layout` says how many are needed.
             shared = open_shared(container)
             entry, name = shared.entries[tag], shared.name
+            if tag in TABLE_SECTIONS and entry.codec == compact.CODEC_GROUPS:
+                raise HyrfFormatError(
+                    f"{name}: section '{tag}' has codec {entry.codec}, which depends on the Gaussians of its own file, "
+                    f"and {container.name} refers to it",
+                    fix="write both files again",
+                )
         if entry is None:
             raise HyrfFormatError(f"{name}: there is no section '{tag}'", fix="the file is incomplete, write it again")
         if entry.codec not in DECODER_BY_CODEC and entry.codec not in compact.SECTIONS_BY_CODEC:

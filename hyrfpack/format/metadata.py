@@ -22,6 +22,9 @@ CODEC_DEFLATED = 5
 MAX_METADATA_BYTES = 1 << 20
 MAX_NESTING_DEPTH = 64  # limits the recursion of functions that walk the objects and lists
 INTEGER_LIMIT = 1 << 63
+# A file may declare this many Gaussians for each of its bytes, plus a constant, because equal Gaussians take no bytes.
+MAX_GAUSSIANS_PER_FILE_BYTE = 32
+EXTRA_GAUSSIANS_PER_FILE = 1 << 18
 
 # JSON types of the configuration's values; a tuple stands for a list of that length. `ModelConfig` checks the ranges.
 _GRID_TYPES = {"log2_table_size": int, "levels": int, "base": int, "finest": int}
@@ -73,8 +76,8 @@ class Metadata:
             deflate: whether to compress the JSON text by deflate.
 
         Raises:
-            ValueError: a value cannot be written as JSON, such as NaN and infinity.
-            HyrfError: the values take more than MAX_METADATA_BYTES, or are nested deeper than MAX_NESTING_DEPTH.
+            HyrfError: a value cannot be written as JSON, such as NaN and infinity, the values take more than
+                MAX_METADATA_BYTES, or they are nested deeper than MAX_NESTING_DEPTH.
         """
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         if not self.layers:
@@ -86,8 +89,11 @@ class Metadata:
             )
         try:
             text = json.dumps(values, sort_keys=True, separators=(",", ":"), allow_nan=False)
-        except TypeError as error:
-            raise ValueError(f"the metadata is not JSON: {error}") from error
+        except (TypeError, ValueError) as error:
+            raise HyrfError(
+                f"the metadata cannot be written as JSON ({error!s:.200})",
+                fix="give a provenance of finite numbers, texts, lists and dictionaries with texts as keys",
+            ) from error
         if len(text) > MAX_METADATA_BYTES:
             raise HyrfError(
                 f"the metadata takes {len(text)} bytes and may take {MAX_METADATA_BYTES}",
@@ -104,6 +110,11 @@ class Metadata:
 def writer_name() -> str:
     """Return the name and the version of this program, as files state them."""
     return f"hyrfpack {__version__}"
+
+
+def gaussian_limit(file_length: int) -> int:
+    """Return the largest number of Gaussians that a file of `file_length` bytes may hold."""
+    return MAX_GAUSSIANS_PER_FILE_BYTE * file_length + EXTRA_GAUSSIANS_PER_FILE
 
 
 def read_metadata(container: Container) -> Metadata:
@@ -157,7 +168,9 @@ def read_metadata(container: Container) -> Metadata:
             raise ValueError(f"there cannot be {values['gaussians']} Gaussians")
         layers = values["layers"]
         _check_type(layers, list, "layers")
-        _check_type(layers, (int,) * min(len(layers), MAX_LAYERS), "layers")
+        if len(layers) > MAX_LAYERS:
+            raise ValueError(f"there are {len(layers)} layers, and there may be {MAX_LAYERS}")
+        _check_type(layers, (int,) * len(layers), "layers")
         if layers and (min(layers) < 0 or sum(layers) != values["gaussians"]):
             raise ValueError(f"its layers do not add up to {values['gaussians']} Gaussians")
     except ValueError as error:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from hyrfpack.checks import has_control_characters, remove_control_characters
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import Container, Section, raw_bytes_limit, read_container
+from hyrfpack.format.metadata import gaussian_limit, read_metadata
 from hyrfpack.format.sections import MAX_PARTS, PART_NAMES, SECTION_CONTENTS, part_section
 from hyrfpack.format.shared import has_shared_sections
 
@@ -74,11 +75,18 @@ def reject_constant(name: str) -> None:
     raise ValueError(f"the number {name} is not finite")
 
 
-def open_parts(container: Container) -> list[tuple[str, Container]]:
-    """Return name and container of each part of a merged file, after a check of all sizes that they declare.
+def open_parts(
+    container: Container, limits_fix: str = "the file is damaged, copy or write it again"
+) -> list[tuple[str, Container]]:
+    """Return name and container of each part of a merged file, after a check of all that the parts declare together.
+
+    Args:
+        container: the merged file.
+        limits_fix: what the error says to do if the parts together exceed the limits of a file.
 
     Raises:
-        HyrfFormatError: a part is missing or damaged, is itself a merged file, or the parts declare too many bytes.
+        HyrfFormatError: a part is missing or damaged, is itself a merged file, the parts declare too many bytes or
+            Gaussians, or some of them are antialiased and others are not.
     """
     parts = []
     for number, part_name in enumerate(read_part_names(container)):
@@ -97,8 +105,19 @@ def open_parts(container: Container) -> list[tuple[str, Container]]:
     declared = sum(entry.raw_length for _, part in parts for entry in part.entries.values())
     if declared > (limit := raw_bytes_limit(container.length)):
         raise HyrfFormatError(
-            f"{container.name}: the parts say they decode to {declared:,} bytes, more than {limit:,}",
-            fix="the file is damaged, copy or write it again",
+            f"{container.name}: the parts say they decode to {declared:,} bytes, more than {limit:,}", fix=limits_fix
+        )
+    metadata = [read_metadata(part) for _, part in parts]
+    count = sum(facts.gaussians for facts in metadata)
+    if count > (limit := gaussian_limit(container.length)):
+        raise HyrfFormatError(
+            f"{container.name}: its parts claim {count:,} Gaussians, but the size of the file allows at most {limit:,}",
+            fix=limits_fix,
+        )
+    if len({facts.config["antialiased"] for facts in metadata}) > 1:
+        raise HyrfFormatError(
+            f"{container.name}: some of its parts are antialiased and others are not",
+            fix="train all of them with the same `antialiased`, and merge them again",
         )
     return parts
 

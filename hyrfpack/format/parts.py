@@ -9,10 +9,8 @@ import torch
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.device import choose_device
-from hyrfpack.errors import HyrfError, HyrfFormatError
-from hyrfpack.format.arrays import parse_config
 from hyrfpack.format.container import Container, Section, read_container, write_container
-from hyrfpack.format.decode import decode_container, gaussian_limit
+from hyrfpack.format.decode import decode_container
 from hyrfpack.format.info import FileReport, section_sizes
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.part_names import CODEC_FILE, ONE_PART_NAME, open_parts, write_part_names
@@ -27,17 +25,15 @@ def encode_parts(parts: Sequence[tuple[str, bytes]]) -> bytes:
     """Encode a merged file of named parts, each the bytes of a `.hyrf` file of one model. The first is the scene.
 
     Raises:
-        HyrfError: the parts together exceed the limits of a file.
+        HyrfFormatError: a part is damaged or no file of one model, the parts together exceed the limits of a file, or
+            some of them are antialiased and others are not.
         ValueError: a name is not valid, or two are equal.
     """
     sections = [write_part_names([name for name, _ in parts])]
     for number, (_, data) in enumerate(parts):
         sections.append(Section(part_section(number), CODEC_FILE, data, len(data)))
     data = write_container(sections, minor=MERGED_MINOR_VERSION)
-    try:
-        _check_gaussians(open_parts(read_container(data, SECTION_CONTENTS)), len(data), "the merged file")
-    except HyrfFormatError as error:
-        raise HyrfError(error.problem, fix="merge fewer models") from error
+    open_parts(read_container(data, SECTION_CONTENTS, "the merged file"), limits_fix="merge fewer models")
     return data
 
 
@@ -109,21 +105,5 @@ def decode_parts(container: Container) -> HybridModel | MergedModel:
     """
     if PART_NAMES not in container.entries:
         return decode_container(container)
-    parts = open_parts(container)
-    _check_gaussians(parts, container.length, container.name)
-    if len({parse_config(read_metadata(part).config).antialiased for _, part in parts}) > 1:
-        raise HyrfFormatError(
-            f"{container.name}: some of its parts are antialiased and others are not", fix="write the file again"
-        )
-    names, models = zip(*((name, decode_container(part)) for name, part in parts), strict=True)
+    names, models = zip(*((name, decode_container(part)) for name, part in open_parts(container)), strict=True)
     return MergedModel(names, models)
-
-
-def _check_gaussians(parts: Sequence[tuple[str, Container]], length: int, name: str) -> None:
-    """Raise HyrfFormatError if the parts claim more Gaussians than the file `name`, of `length` bytes, may have."""
-    count, limit = sum(read_metadata(part).gaussians for _, part in parts), gaussian_limit(length)
-    if count > limit:
-        raise HyrfFormatError(
-            f"{name}: its parts claim {count:,} Gaussians, but the size of the file allows at most {limit:,}",
-            fix="the file is damaged, copy or write it again",
-        )

@@ -16,7 +16,8 @@ def with_metadata(container: Container, config: ModelConfig, provenance: dict) -
     """Return the bytes of a file of one model with another configuration and provenance.
 
     Args:
-        container: the file. All sections but its metadata keep their bytes.
+        container: the file. All sections but its metadata keep their bytes; optional ones of unknown types are left
+            out, because they may depend on what changes.
         config: the configuration; hash grids and decoders must be those of the file.
         provenance: as for `hyrfpack.save_model`.
 
@@ -28,5 +29,6 @@ def with_metadata(container: Container, config: ModelConfig, provenance: dict) -
     sections = [
         metadata.to_section(deflate=entry.codec == CODEC_DEFLATED) if entry.type == METADATA else container[entry.type]
         for entry in container.entries.values()
+        if entry.type in container
     ]
     return write_container(sections, minor=lowest_minor_version(sections, metadata.config))

@@ -38,7 +38,7 @@ def refer_to_section(entry: Entry, file_name: str) -> Section:
 
 def has_shared_sections(container: Container) -> bool:
     """Return whether sections of a file lie in another file."""
-    return any(entry.codec == CODEC_SHARED for entry in container.entries.values())
+    return any(tag in container.entries and container.entries[tag].codec == CODEC_SHARED for tag in SHARED_SECTIONS)
 
 
 def open_shared(container: Container) -> Container:
@@ -83,13 +83,17 @@ def read_provenance(container: Container) -> dict:
 
 
 def self_contained_bytes(container: Container) -> bytes:
-    """Return the bytes of a file, with copies of the sections that it shares with others."""
+    """Return the bytes of a file, with copies of the sections that it shares with others.
+
+    Optional sections of unknown types are left out of a file that changes.
+    """
     if not has_shared_sections(container):
         return container.read_bytes()
     metadata = replace(read_metadata(container), provenance=read_provenance(container))
     sections = [
         metadata.to_section(deflate=entry.codec == CODEC_DEFLATED) if tag == METADATA else read_section(container, tag)
         for tag, entry in container.entries.items()
+        if tag in container
     ]
     return write_container(sections, minor=lowest_minor_version(sections, metadata.config))
 

@@ -429,6 +429,13 @@ def test_invalid_layer_counts_are_refused(layers, fraction):
         decode_model(data, fraction=fraction)
 
 
+def test_more_layers_than_a_file_may_have_are_named_as_the_problem():
+    data = replace_metadata(build_layered_file(SAMPLE_MODEL, [400, 200]), metadata_section(SAMPLE_MODEL, 9 * [1]))
+
+    with pytest.raises(HyrfFormatError, match="there are 9 layers, and there may be 8"):
+        decode_model(data)
+
+
 @pytest.mark.parametrize("fraction", [None, 1.0])
 def test_layers_without_sections_are_refused(fraction):
     for missing in layer_sections(1):

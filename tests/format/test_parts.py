@@ -9,15 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from forged_files import file_with_most_gaussians
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import small_model
 
-from hyrfpack.errors import HyrfFormatError
+from hyrfpack.edit import merge_models
+from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import describe_file, encode_model, load_merged_model, load_model, repack
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import load_parts
 from hyrfpack.format.container import MINOR_VERSION, Section, read_container, write_container
+from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.part_names import write_part_names
 from hyrfpack.format.parts import encode_parts, write_parts
 from tools.safety import minimal_reader
@@ -240,7 +243,51 @@ def test_the_same_parts_give_the_same_bytes(tmp_path):
 
 def test_parts_with_and_without_antialiasing_are_refused_in_one_line(tmp_path):
     files = [encode_model(small_model(np.zeros((3, 3)), antialiased=antialiased)) for antialiased in (False, True)]
-    (tmp_path / "mixed.hyrf").write_bytes(encode_parts([("a", files[0]), ("b", files[1])]))
+    sections = [write_part_names(["a", "b"]), *(part(file, number) for number, file in enumerate(files))]
+    path = write_file(tmp_path, write_container(sections, MINOR_VERSION))
 
+    for read in (load_merged_model, load_parts, describe_file):
+        with pytest.raises(HyrfFormatError, match=r"merged.hyrf: some of its parts are antialiased and others are not"):
+            read(path)
     with pytest.raises(HyrfFormatError, match="some of its parts are antialiased and others are not"):
-        load_merged_model(tmp_path / "mixed.hyrf")
+        encode_parts([("a", files[0]), ("b", files[1])])
+
+
+def test_parts_together_may_not_claim_more_gaussians_than_one_file(tmp_path):
+    """A file of a kilobyte may hold 2^18 Gaussians; so may not two in a file of two kilobytes."""
+    data = file_with_most_gaussians()
+    sections = [write_part_names(["a", "b"]), part(data, 0), part(data, 1)]
+    path = write_file(tmp_path, write_container(sections, MINOR_VERSION))
+
+    for read in (load_merged_model, load_parts, describe_file):
+        with pytest.raises(HyrfFormatError, match=r"parts claim 524,088 Gaussians.*the file is damaged"):
+            read(path)
+    with pytest.raises(HyrfError, match=r"parts claim 524,088 Gaussians.*merge fewer models"):
+        encode_parts([("a", data), ("b", data)])
+
+
+def test_a_damaged_part_is_not_blamed_on_the_number_of_models():
+    with pytest.raises(HyrfError, match="part 'b': .*copy or write it again") as error:
+        encode_parts([("a", PAPER), ("b", COMPACT[:-8])])
+    assert "fewer models" not in str(error.value)
+
+
+def test_an_error_of_a_configuration_names_the_file_and_the_part(tmp_path):
+    container = read_container(PAPER)
+    metadata = read_metadata(container)
+    changed = replace(metadata, config={**metadata.config, "hidden": 5000}).to_section()
+    data = write_container([changed, *(each for each in container.sections if each.type != "META")], MINOR_VERSION)
+    path = write_file(tmp_path, encode_parts([("room", PAPER), ("chair", data)]))
+
+    for read in (load_merged_model, lambda file: merge_models([file], tmp_path / "again.hyrf")):
+        with pytest.raises(HyrfFormatError, match=r"merged.hyrf: part 'chair': the model's configuration is not valid"):
+            read(path)
+
+
+def test_an_optional_section_of_unknown_type_with_the_number_of_a_reference_is_skipped(tmp_path):
+    note = Section("NOTE", 12, b"\0" * 16, 16, required=False)
+    data = write_container([*read_container(PAPER).sections, note], MINOR_VERSION)
+
+    merged = load_merged_model(write_file(tmp_path, encode_parts([("a", data), ("b", COMPACT)])))
+
+    assert list(merged.names) == ["a", "b"]

@@ -23,7 +23,7 @@ from scenes import small_model
 from hyrfpack.cli.info import info
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import encode_model, repack
-from hyrfpack.format.decode import EXTRA_GAUSSIANS_PER_FILE, gaussian_limit
+from hyrfpack.format.metadata import EXTRA_GAUSSIANS_PER_FILE, gaussian_limit
 from hyrfpack.format.sections import SECTION_CONTENTS
 from tools.safety.fuzz import allowed_bytes, check_file, check_model, decode, message_pattern
 from tools.safety.fuzz_mutate import (

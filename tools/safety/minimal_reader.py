@@ -285,7 +285,11 @@ def read_container(data: bytes, part: bool = False) -> dict[str, Section]:
 
 def follow_references(sections: dict[str, Section], folder: dict[str, bytes]) -> dict[str, Section]:
     """Replace sections of codec 12 by those that they refer to; return the sections of the other file, if any."""
-    references = {name: section for name, section in sections.items() if section.codec == 12 and section.whole}
+    references = {
+        name: section
+        for name, section in sections.items()
+        if section.codec == 12 and section.whole and name in KNOWN_SECTION_TYPES
+    }
     names = set()
     for section in references.values():
         require(section.name in {"EXPO", *FIELD_GROUPS}, f"{section.name}: codec 12 not allowed here")
@@ -300,6 +304,8 @@ def follow_references(sections: dict[str, Section], folder: dict[str, bytes]) ->
     shared = read_container(folder[name.decode()])
     for own in references.values():
         require(own.name in shared and shared[own.name].codec != 12, f"{own.name}: not in the other file")
+        depends_on_points = own.name in ("GTAB", "RTAB") and shared[own.name].codec == 8
+        require(not depends_on_points, f"{own.name}: codec 8 in the other file")
         require(shared[own.name].crc == struct.unpack("<I", own.read()[:4])[0], f"{own.name}: another section")
         sections[own.name] = shared[own.name]
     return shared
