@@ -238,6 +238,51 @@ def test_streams_of_every_kind_decode_to_the_same_integers(kind, contexts):
     assert np.array_equal(read, values)
 
 
+WRONG_VALUES = [None, True, 3, -1, 10**400, 1.5, "red", "", [], [1], [1, 1], [1, 1, True], [1, "1", 1], 4 * [0], {}]
+METADATA_PATHS = [
+    *(["gaussians"], ["layers"], ["rules"], ["profile"], ["settings"], ["provenance"], ["writer"], ["config"]),
+    *(["config", key] for key in sorted(minimal_reader.CONFIG_KEYS)),
+    *(["config", "frame", key] for key in sorted(minimal_reader.FRAME_KEYS | {"rotation"})),
+    *(["config", "radiance", key] for key in sorted(minimal_reader.GRID_KEYS)),
+    ["config", "residual_degree"],
+]
+
+
+@pytest.mark.parametrize("path", METADATA_PATHS, ids=".".join)
+def test_both_readers_refuse_the_same_values_of_metadata(path):
+    sections = list(read_container(encode(random_model(3), "raw")).sections)
+    text = bytes(sections[0].data)
+    assert sections[0].type == "META"
+    refused = 0
+    for value in WRONG_VALUES:
+        metadata = json.loads(text)
+        inner = metadata
+        for key in path[:-1]:
+            inner = inner[key]
+        inner[path[-1]] = value
+        changed = json.dumps(metadata).encode()
+        meta = replace(sections[0], data=changed, raw_length=len(changed))
+        data = write_container([meta, *sections[1:]], minor=MINOR_VERSION)
+        try:
+            minimal_reader.read(data)
+        except ValueError:
+            refused += 1
+            with pytest.raises(HyrfFormatError):
+                decode_model(data)
+        else:
+            decode_model(data)
+
+    assert refused > len(WRONG_VALUES) / 2
+
+
+def test_a_file_without_metadata_or_names_is_refused():
+    empty = write_container([], minor=0)
+
+    for read in (minimal_reader.read, minimal_reader.read_parts):
+        with pytest.raises(ValueError):
+            read(empty)
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 def test_both_readers_have_the_same_limit_for_the_basis(sign):
     sections = list(read_container(encode(random_model(30), "compact")).sections)

@@ -54,6 +54,7 @@ CONFIG_KEYS = {
 }
 FRAME_KEYS = {"center", "scale", "half_extent"}
 GRID_KEYS = {"log2_table_size", "levels", "base", "finest"}
+LARGEST_FLOAT = 2**1024 - 2**970
 
 
 def read(
@@ -138,6 +139,7 @@ def read_parts(data: bytes) -> list[tuple[str, Any]]:
     The arguments and the errors are those of `read`.
     """
     sections = read_container(data)
+    require("PRTS" in sections, "this is no merged file")
     names = sections["PRTS"]
     require(names.codec == 0 and names.raw_length == names.stored_length <= 2**16, "PRTS: unknown codec or size")
     content = json.loads(names.read().decode("utf-8"))
@@ -302,6 +304,7 @@ def follow_references(sections: dict[str, Section], folder: dict[str, bytes]) ->
     require(re.fullmatch(rb"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}", name) is not None, "bad name of a file")
     require(name.endswith(b".hyrf") and len(name) <= 64 and name.decode() in folder, "a file is missing")
     shared = read_container(folder[name.decode()])
+    require("META" in shared, "the other file has no metadata")
     for own in references.values():
         require(own.name in shared and shared[own.name].codec != 12, f"{own.name}: not in the other file")
         depends_on_points = own.name in ("GTAB", "RTAB") and shared[own.name].codec == 8
@@ -327,12 +330,14 @@ def read_metadata(section: Section) -> dict[str, Any]:
     require(all(map(math.isfinite, list_floats(metadata))), "META: NaN or infinity")
     require(METADATA_KEYS <= metadata.keys(), "META: a key is missing")
     require(metadata["rules"] == REQUIRED_RULES, "META: other rules")
+    for key in ("settings", "provenance"):
+        require(isinstance(metadata[key], dict), f"META: {key} is no object")
+    for key in ("profile", "writer"):
+        require(isinstance(metadata[key], str), f"META: {key} is no text")
     config = metadata["config"]
+    check_keys(config, CONFIG_KEYS, "residual_degree")
     frame = config["frame"]
-    require(
-        set(config) - {"residual_degree"} == CONFIG_KEYS and set(frame) - {"rotation"} == FRAME_KEYS,
-        "META: unknown or missing keys in config",
-    )
+    check_keys(frame, FRAME_KEYS, "rotation")
     check_integer(metadata["gaussians"], 0, 2**40 - 1)
     layers = metadata.get("layers", [])
     require(isinstance(layers, list) and len(layers) <= 8, "META: layers")
@@ -344,19 +349,33 @@ def read_metadata(section: Section) -> dict[str, Any]:
     if "residual_degree" in config:
         check_integer(config["residual_degree"], 0, 3)
     for grid in (config["geometry"], config["radiance"]):
-        require(set(grid) == GRID_KEYS, "META: unknown or missing keys in a grid")
+        check_keys(grid, GRID_KEYS)
         check_integer(grid["log2_table_size"], 4, 24)
         check_integer(grid["levels"], 1, 32)
         check_integer(grid["finest"], check_integer(grid["base"], 2, 65536), 65536)
     require(config["direction_encoding"] in ("sh", "frequency"), "META: direction_encoding")
     require(config["scale_rule"] in ("sum", "product"), "META: scale_rule")
+    for key in ("background", "scale_grows", "antialiased", "position_gradients"):
+        require(isinstance(config[key], bool), f"META: {key} is no boolean")
+    check_numbers(config["solid"], 3)
+    check_numbers(frame["center"], 3)
+    check_numbers([frame["scale"]], 1)
+    check_numbers(frame["half_extent"], 3)
     require(frame["scale"] > 0 and min(frame["half_extent"]) > 0, "META: frame")
     if "rotation" in frame:
-        quaternion = frame["rotation"]
-        require(isinstance(quaternion, list) and len(quaternion) == 4, "META: rotation")
-        require(all(type(number) in (int, float) for number in quaternion), "META: rotation")
-        require(abs(math.hypot(*quaternion) - 1) <= 1e-6, "META: the rotation has no unit length")
+        check_numbers(frame["rotation"], 4)
+        require(abs(math.hypot(*frame["rotation"]) - 1) <= 1e-6, "META: the rotation has no unit length")
     return metadata
+
+
+def check_keys(value: Any, keys: set[str], *optional: str) -> None:
+    require(isinstance(value, dict) and set(value) - {*optional} == keys, "META: unknown or missing keys in config")
+
+
+def check_numbers(value: Any, count: int) -> None:
+    require(isinstance(value, list) and len(value) == count, f"META: {value!r:.40} is no list of {count}")
+    is_valid = all(type(number) in (int, float) and abs(number) <= LARGEST_FLOAT for number in value)
+    require(is_valid, f"META: {value!r:.40} holds something else than numbers")
 
 
 def nesting_depth(value: Any) -> int:
