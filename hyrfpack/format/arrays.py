@@ -120,11 +120,17 @@ def decoder_widths(config: ModelConfig) -> dict[str, tuple[int, int, int, int]]:
 
 
 def to_model(config: ModelConfig, arrays: dict[str, np.ndarray]) -> HybridModel:
-    """Build a model from matrices: the inverse of `to_arrays`. Shapes must be those of `group_shapes`."""
+    """Build a model from matrices: the inverse of `to_arrays`. Shapes must be those of `group_shapes`.
+
+    The model keeps the arrays of all sections but the decoders, and must be their only owner.
+    """
     gaussians = to_gaussians(arrays)
     with torch.device("meta"):  # has shapes but no storage, so that no random initial values are computed
         model = HybridModel(config, gaussians)
-    model.load_state_dict({name: value.clone() for name, value in iter_parameters(arrays, model)}, assign=True)
+    # The parameters of a decoder are views of one array, so each gets a copy of its own.
+    views = {name for group in sections.DECODER_SECTIONS for name in SECTION_PARAMETERS[group]}
+    parameters = iter_parameters(arrays, model)
+    model.load_state_dict({name: value.clone() if name in views else value for name, value in parameters}, assign=True)
     return model
 
 
