@@ -79,8 +79,8 @@ class PhotoCameras:
 
             q = 1 / (r max over the cameras that see the point of f / z)
 
-        with the focal length f, the depth z and `rate_ratio` r. If none sees the point, f / distance is the rate of all
-        of them.
+        with the focal length f, the depth z and `rate_ratio` r. If none sees the point, f / max(distance, 0.01) is the
+        rate of all of them.
 
         Args:
             points: (N, 3) float32 in local units: local = axes^T (world - center) / scale.

@@ -104,11 +104,6 @@ class HuffmanCode:
         shares = np.uint64(1) << (np.uint64(64) - self.lengths.astype(np.uint64))
         return np.cumsum(shares, dtype=np.uint64) - shares  # exact although the last sum, 2^64, wraps to 0
 
-    @property
-    def codes(self) -> np.ndarray:
-        """Return the (n,) uint64 codes as numbers of `lengths` bits, as in dahuffman's code table."""
-        return self.left_aligned_codes >> (np.uint64(64) - self.lengths.astype(np.uint64))
-
     def check(self) -> None:
         """Raise DamagedDataError unless this is a complete prefix code with each symbol once (or the empty code)."""
         if len(self.symbols) == 0:
