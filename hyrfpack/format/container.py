@@ -17,7 +17,7 @@ import zlib
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.run_folder import SCENE_MANIFEST_FILE, find_model
@@ -98,6 +98,7 @@ class Container:
         version: (major, minor) version of the format.
         entries: the whole table of contents by type, in file order, unknown optional sections included.
         open_file: opens another file of the same folder by its name; None if there is no folder.
+        parsed: what readers have parsed of sections, by the type of the section, so that they parse it once.
     """
 
     open_file: Callable[[str], Container] | None = None
@@ -133,6 +134,7 @@ class Container:
         self._known = known
         self._close: Callable[[], None] = lambda: None
         self._siblings: dict[str, Container] = {}
+        self.parsed: dict[str, Any] = {}
         self.version, toc, count = self._read_header()
         self.entries = self._check_toc(toc, count)
 

@@ -120,9 +120,18 @@ def gaussian_limit(file_length: int) -> int:
 def read_metadata(container: Container) -> Metadata:
     """Read the metadata and check the types of `config`; the other objects may hold anything.
 
+    They are parsed once for each container, so the caller must not change them.
+
     Raises:
         HyrfFormatError: the section is absent, too long, not JSON, or a field is missing or of the wrong type.
     """
+    if METADATA not in container.parsed:
+        container.parsed[METADATA] = _parse_metadata(container)
+    metadata: Metadata = container.parsed[METADATA]
+    return metadata
+
+
+def _parse_metadata(container: Container) -> Metadata:
     name, entry = container.name, container.entries.get(METADATA)
     if entry is not None and (entry.raw_length > MAX_METADATA_BYTES or entry.codec not in (CODEC_JSON, CODEC_DEFLATED)):
         raise HyrfFormatError(
