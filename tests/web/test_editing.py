@@ -85,6 +85,7 @@ def test_merged_files_can_be_measured_but_not_edited(browser: Browser, tmp_path:
     assert not browser.evaluate("document.getElementById('edit-add-box').checkVisibility()")
     click(browser, "[data-tool=measure]")
     assert browser.evaluate("document.getElementById('edit-clear').checkVisibility()")
+    assert not browser.evaluate("document.getElementById('edit-rescale').checkVisibility()"), "a scale is an edit"
 
 
 # ---- cropping and cleaning
@@ -214,6 +215,61 @@ def test_keys_move_and_turn_the_box(browser: Browser, tmp_path: Path):
     assert middle_and_sides(wider)[1][0] - sides[0] == pytest.approx(10 * step, abs=2e-3)
     fill(browser, "#edit-turn", 0)
     assert len(list_actions(browser)[-1]["value"]) == 6
+
+
+def test_a_box_is_drawn_and_applied_about_the_up_direction_before_it(browser: Browser, tmp_path: Path):
+    model = make_model(2600)
+    load_editable_page(browser, tmp_path, make_editable_page(model))
+    click(browser, "#edit-add-box")
+    box = list_actions(browser)[0]["value"]
+    later_up = [0.8, 0.0, 0.6]
+    browser.evaluate(f"hyrfpack.editor.tools.up.state({later_up})")
+    browser.evaluate(f"document.querySelectorAll('#edit-handles button')[{TURN_HANDLE}].focus()")
+    for _ in range(4):
+        browser.press("ArrowRight", shift=True)
+
+    first, turned, last = list_actions(browser)
+    assert [action["option"] for action in (first, turned, last)] == ["up", "crop-box", "up"]
+    up = UP_DIRECTION / np.linalg.norm(UP_DIRECTION)
+    np.testing.assert_allclose(first["value"], up, atol=1e-5)
+    assert turned["value"] == [*box, 40] and last["value"] == later_up
+    turn = Rotation.from_rotvec(np.radians(40) * up)
+    np.testing.assert_allclose(
+        browser.evaluate("hyrfpack.editor.tools.crop.describe().turn"), turn.as_matrix(), atol=1e-5
+    )
+    middle, sides = middle_and_sides(box)
+    positions = TURNED_FRAME.to_world(model.gaussians.positions.detach().numpy())
+    inside = (np.abs(turn.inv().apply(positions - middle)) <= sides / 2).all(1)
+    assert wait_until_applied(browser) == inside.sum() and 50 < inside.sum() < 2500
+
+
+def test_typed_degrees_are_wrapped_to_half_a_turn(browser: Browser, tmp_path: Path):
+    load_editable_page(browser, tmp_path, make_editable_page(make_model(50)))
+    click(browser, "#edit-add-box")
+    for typed, degrees in ((270, -90), (180, 180), (-190.5, 169.5)):
+        fill(browser, "#edit-turn", typed)
+        assert list_actions(browser)[-1]["value"][6] == degrees
+
+
+def test_an_undo_during_a_drag_of_a_handle_removes_the_box(browser: Browser, tmp_path: Path):
+    browser.resize(1000, 700, phone=True)
+    load_editable_page(browser, tmp_path, make_editable_page(make_model(50)))
+    click(browser, "#edit-add-box")
+    x, y = middle_of(browser, "#edit-handles button", 1)
+    browser.touch("touchStart", (x, y))
+    browser.touch("touchMove", (x + 20, y))
+    browser.evaluate("hyrfpack.editor.go(-1)")
+    browser.touch("touchMove", (x + 40, y))
+    browser.touch("touchEnd")
+    assert list_actions(browser) == [] and browser.list_errors() == []
+
+
+def test_undo_moves_the_slider_that_has_the_focus(browser: Browser, tmp_path: Path):
+    load_editable_page(browser, tmp_path, make_editable_page(make_model(50)), tool="clean")
+    fill(browser, "#edit-faint", 20)
+    fill(browser, "#edit-faint", 70)
+    browser.evaluate("document.getElementById('edit-faint').focus(), hyrfpack.editor.go(-1)")
+    assert browser.evaluate("Number(document.getElementById('edit-faint').value)") == 20
 
 
 def test_undo_and_redo_step_through_the_actions(browser: Browser, tmp_path: Path):

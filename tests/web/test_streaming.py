@@ -28,6 +28,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel
 from hyrfpack.scene import Camera
 from hyrfpack.web import view as view_module
+from hyrfpack.web.player import encode_player
 from hyrfpack.web.serve import serve_in_thread
 from tools.browser.frames import frame_observer_script
 
@@ -68,6 +69,14 @@ def test_a_scene_folder_is_drawn_as_python_renders_it(browser: Browser, scene_ho
     reference = np.clip(np.asarray(hyrfpack.render_view(scene.load(), camera).rgb) * 255, 0, 255)
     assert psnr(picture.astype(float), reference) > MIN_PSNR_DB
     assert browser.evaluate("document.title").startswith(scene.manifest.title)
+
+
+def test_a_scene_folder_offers_no_editing(browser: Browser, scene_host: Site):
+    scene_host.files["/index.html"] = encode_player("a scene", editable=True)
+    open_scene(browser, scene_host)
+    browser.evaluate("hyrfpack.ready")
+    wait_until(browser, "hyrfpack.player.whole")
+    assert not browser.evaluate("document.getElementById('edit-button').checkVisibility()")
 
 
 def reference_picture(model, camera: Camera) -> np.ndarray:

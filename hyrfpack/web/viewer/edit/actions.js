@@ -106,8 +106,8 @@ export function roundLength(value, size) {
   return Number(value.toFixed(digits)) + 0; // turns -0 into 0
 }
 
-// Rounds the parts of a unit vector.
-export const roundDirection = (vector) => vector.map((part) => Number(part.toFixed(DIRECTION_DIGITS)) + 0);
+// Returns the action that states an up direction, a unit vector.
+export const statedUp = (up) => ({ option: "up", value: up.map((part) => Number(part.toFixed(DIRECTION_DIGITS)) + 0) });
 
 // Returns the command that applies actions to a file, for POSIX shells and PowerShell; for the former alone if the
 // file's name has both an apostrophe and a character that is special in double quotes.

@@ -40,13 +40,15 @@ export class CleanTool {
 
   refresh() {
     const { actions, size } = this.editor;
-    for (const [name, { option, positionOf, textOf }] of Object.entries(SLIDERS)) {
+    for (const [name, { option, valueOf, positionOf, textOf }] of Object.entries(SLIDERS)) {
       const slider = element(`edit-${name}`), active = actions[findActive(actions, option)];
-      if (document.activeElement !== slider || !active) {
-        slider.value = active ? Math.max(1, Math.round(100 * positionOf(active.value, size))) : 0;
+      if (!active) slider.value = 0;
+      else if (valueOf(slider.value / 100, size) !== active.value) { // else its position may be finer than the value
+        slider.value = Math.max(1, Math.round(100 * positionOf(active.value, size)));
       }
-      slider.nextElementSibling.textContent = active ? textOf(active.value) : "none";
-      slider.setAttribute("aria-valuetext", slider.nextElementSibling.textContent);
+      const text = active ? textOf(active.value) : "none";
+      slider.nextElementSibling.textContent = text;
+      slider.setAttribute("aria-valuetext", text);
     }
   }
 }

@@ -16,51 +16,39 @@ const KEY_MOVES = {
 };
 
 export class CropBox {
-  // `getBox()` returns the box or null, see CropTool.describe. `change(value, isFinal)` is called with new numbers.
+  // `getBox()` returns the box or null, see CropTool.describe. `change` is CropTool.put: `change({ value }, false)` is
+  // called with new numbers, and `change({})` when they are final.
   constructor(player, getBox, change) {
     Object.assign(this, { player, getBox, change });
     this.arm = 3; // of those that turnArms returns
-    this.handles = FACES.map((face) => this.createFaceHandle(face));
-    this.mover = this.createHandle("move", "Move the box", "drag it, or use arrow keys, Page Up and Page Down", {
-      grab: (event) => this.grabMiddle(event),
-      step: (event) => this.stepMove(event),
+    this.handles = FACES.map(({ axis, side }) => {
+      const letter = "xyz"[axis], label = `${side ? "maximum" : "minimum"} ${letter} of the box`;
+      const grab = (event) => this.grabFace(event, axis, side), step = (event) => this.stepFace(event, axis, side);
+      return this.createHandle(letter, label, grab, step);
     });
-    this.turner = this.createHandle("turn", "Turn of the box in degrees", "drag it, or use arrow keys", {
-      grab: (event) => this.grabTurn(event),
-      step: (event) => this.stepTurn(event),
-    });
-    this.turner.setAttribute("role", "slider");
-    this.turner.setAttribute("aria-valuemin", -180);
-    this.turner.setAttribute("aria-valuemax", 180);
+    this.mover = this.createHandle("move", "Move the box", this.grabMiddle, this.stepMove, ", Page Up and Page Down");
+    this.turner = this.createHandle("turn", "Turn of the box in degrees", this.grabTurn, this.stepTurn);
+    // Sliders would need limits.
+    for (const handle of [...this.handles, this.turner]) handle.setAttribute("role", "spinbutton");
     element("edit-handles").replaceChildren(...this.handles, this.mover, this.turner);
   }
 
-  createFaceHandle(face) {
-    const letter = "xyz"[face.axis], end = face.side ? "maximum" : "minimum";
-    const handle = this.createHandle(letter, `${end} ${letter} of the box`, "drag it, or use arrow keys", {
-      grab: (event) => this.grabFace(event, face),
-      step: (event) => this.stepFace(event, face),
-    });
-    handle.setAttribute("role", "slider");
-    return handle;
-  }
-
-  // Makes a handle. `grab(event)` returns a function of later events that returns the numbers of the box, or null; so
-  // does `step(event)` for a key, which it does not know if it returns null.
-  createHandle(name, label, use, { grab, step }) {
+  // Makes a handle. The method `grab(event)` returns a function of later events that returns the numbers of the box, or
+  // null; so does `step(event)` for a key, which it does not know if it returns null. `moreKeys` are for its tooltip.
+  createHandle(name, label, grab, step, moreKeys = "") {
     const handle = document.createElement("button");
     handle.className = name;
     handle.setAttribute("aria-label", label);
-    handle.title = `${label}: ${use}`;
+    handle.title = `${label}: drag it, or use arrow keys${moreKeys}`;
     handle.onpointerdown = (event) => this.press(event, handle, grab);
     handle.onkeydown = (event) => {
-      const value = step(event);
+      const value = step.call(this, event);
       if (!value) return;
       event.preventDefault();
       event.stopPropagation(); // arrow keys also turn the eye
-      this.change(value, false);
+      this.change({ value }, false);
     };
-    handle.onkeyup = () => this.drawn && this.change(this.getBox().value, true);
+    handle.onkeyup = () => this.change({});
     return handle;
   }
 
@@ -70,20 +58,20 @@ export class CropBox {
     event.preventDefault();
     handle.focus();
     handle.setPointerCapture(event.pointerId);
-    const follow = grab(event);
+    const follow = grab.call(this, event);
     handle.onpointermove = (moved) => {
       const value = follow(moved);
-      if (value) this.change(value, false);
+      if (value) this.change({ value }, false);
     };
     handle.onpointerup = handle.onpointercancel = handle.onlostpointercapture = () => {
       handle.onpointermove = handle.onpointerup = handle.onpointercancel = handle.onlostpointercapture = null;
-      this.change(this.getBox().value, true);
+      this.change({});
     };
   }
 
   // ---- a face, along its axis
 
-  grabFace(event, { axis, side }) {
+  grabFace(event, axis, side) {
     const box = this.getBox(), middle = faceMiddle(box, axis, side);
     const along = (pointer) => this.projection.along(middle, box.axes[axis], placeOf(pointer));
     const start = along(event);
@@ -94,7 +82,7 @@ export class CropBox {
     };
   }
 
-  stepFace(event, { axis, side }) {
+  stepFace(event, axis, side) {
     const sign = KEY_SIGNS[event.key], box = this.getBox();
     return sign ? withSide(box, axis, side, box.value[axis + 3 * side] + sign * stepLength(event, box)) : null;
   }
@@ -161,7 +149,6 @@ export class CropBox {
   place(projection) {
     const box = this.getBox();
     this.projection = projection;
-    this.drawn = box !== null;
     if (box) this.chooseArm(box);
     const show = (handle, point) => {
       const place = point && projection.place(point);
@@ -217,8 +204,5 @@ function withSide({ value, turn }, axis, side, position) {
 
 const withMove = (value, shift) => value.map((place, k) => (k < 6 ? place + shift[k % 3] : place));
 
-// Returns the numbers of a box that is turned further, to between -180 and 180 degrees.
-function withTurn(value, degrees) {
-  const turned = (value[6] ?? 0) + degrees;
-  return [...value.slice(0, 6), turned - 360 * Math.round(turned / 360)];
-}
+// Returns the numbers of a box that is turned further.
+const withTurn = (value, degrees) => [...value.slice(0, 6), (value[6] ?? 0) + degrees];

@@ -3,7 +3,8 @@
 import { element } from "../dom.js";
 import { frameAxes, rotateBack, rotateBy, transpose } from "../../hyrf/rotation.js";
 import { add, mul, sub } from "../../hyrf/vectors.js";
-import { boxTurn, dropAction, findActive, middleOf, putAction, roundDirection, roundLength } from "./actions.js";
+import { boxTurn, middleOf, placementAfter, roundLength } from "./actions.js";
+import { dropAction, findActive, putAction, statedUp } from "./actions.js";
 import { CropBox } from "./crop_box.js";
 
 const OPTION = "crop-box";
@@ -13,7 +14,7 @@ const FIRST_SIDE_RATIO = 0.3; // half the sides of a new box, of the cameras' di
 export class CropTool {
   constructor(editor) {
     this.editor = editor;
-    this.box = new CropBox(editor.player, () => this.describe(), (value, isFinal) => this.put({ value }, isFinal));
+    this.box = new CropBox(editor.player, () => this.describe(), (change, isFinal) => this.put(change, isFinal));
     const sides = document.querySelectorAll("#edit-box [type=number]:not(#edit-turn)");
     this.inputs = [...sides, element("edit-turn")]; // in the order of the numbers of a box
     for (const input of this.inputs) {
@@ -28,6 +29,12 @@ export class CropTool {
   // The action of the box with handles, or undefined.
   get active() {
     return this.editor.actions[findActive(this.editor.actions, OPTION)];
+  }
+
+  // The actions before that of the box. The box turns about the up direction after these.
+  get before() {
+    const { actions } = this.editor;
+    return actions.slice(0, findActive(actions, OPTION));
   }
 
   get drawn() {
@@ -54,17 +61,19 @@ export class CropTool {
     editor.set([...editor.actions, { option: OPTION, value }]);
   }
 
-  // Changes the box with handles. The command states up before a box that is turned about it, so that it does not
-  // depend on what the page knows of the file.
-  put({ value = this.active.value, isInverted = this.active.isInverted }, isFinal = true) {
-    const { editor } = this, rounded = value.slice(0, 6).map((place) => roundLength(place, editor.size));
-    const degrees = Number((value[6] ?? 0).toFixed(DEGREE_DIGITS));
+  // Changes the box with handles, unless it was undone meanwhile. The command states up before a box that is turned
+  // about it, so that it does not depend on what the page knows of the file.
+  put(change, isFinal = true) {
+    const { editor, active, before } = this;
+    if (!active) return;
+    const { value, isInverted } = { ...active, ...change }, turned = value[6] ?? 0;
+    const rounded = value.slice(0, 6).map((place) => roundLength(place, editor.size));
+    const degrees = Number((turned + 360 * Math.round(-turned / 360)).toFixed(DEGREE_DIGITS)); // over -180, to 180
     if (degrees) rounded.push(degrees);
-    const action = { option: OPTION, value: rounded, ...(isInverted ? { isInverted } : {}) };
+    const action = { option: OPTION, value: rounded, ...(isInverted && { isInverted }) };
     let { actions } = editor;
-    if (degrees && !actions.some(({ option }) => option === "up")) {
-      const up = { option: "up", value: roundDirection(editor.placement.up) };
-      actions = actions.toSpliced(findActive(actions, OPTION), 0, up);
+    if (degrees && !before.some(({ option }) => option === "up")) {
+      actions = actions.toSpliced(before.length, 0, statedUp(placementAfter(before, editor.player.scene).up));
     }
     editor.set(putAction(actions, action), isFinal);
   }
@@ -94,7 +103,8 @@ export class CropTool {
   describe() {
     const { active, editor } = this;
     if (!active) return null;
-    const { player: { scene }, placement: { factor, rows, up }, size } = editor, { value } = active;
+    const { player: { scene }, size } = editor, { factor, rows, up } = placementAfter(this.before, scene);
+    const { value } = active;
     const turn = boxTurn(value, up), center = middleOf(value.slice(0, 3), value.slice(3, 6));
     const turnBack = (vector) => rotateBack(frameAxes(scene), rotateBack(rows, vector));
     const origin = mul(rotateBack(frameAxes(scene), scene.center), 1 / scene.unit);

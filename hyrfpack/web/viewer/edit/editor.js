@@ -13,8 +13,6 @@ import { SaveTool } from "./save_tool.js";
 import { UpTool } from "./up_tool.js";
 import { ViewsTool } from "./views_tool.js";
 
-const MERGED_TEXT = "This file holds several models. 'hyrfpack edit' crops and turns them all, or takes one " +
-  "out by --part to edit here.";
 const TOOLS_FOR_ANY_FILE = ["measure", "views"]; // these change nothing
 
 export class Editor {
@@ -53,7 +51,8 @@ export class Editor {
 
   // Offers to edit a scene that is loaded.
   offer() {
-    element("edit-button").hidden = !this.player.whole || this.player.scene.kind !== "hyrf";
+    const { whole, scene } = this.player;
+    element("edit-button").hidden = !whole || scene.kind !== "hyrf" || scene.isStreamed;
   }
 
   // The name of the scene's file, or its path if the page knows it.
@@ -96,10 +95,10 @@ export class Editor {
     }
     for (const pane of document.querySelectorAll("[data-pane]")) pane.hidden = pane.dataset.pane !== name || isRefused;
     element("edit-refusal").hidden = !isRefused;
-    element("edit-refusal").textContent = MERGED_TEXT;
-    element("edit-foot").hidden = isMerged;
-    this.navigation.controls.pick = isOpen && this.tool.pick ? (x, y) => this.tool.pick(x, y) : null;
-    document.body.classList.toggle("picking", this.navigation.controls.pick !== null);
+    element("edit-foot").hidden = element("edit-scale").hidden = isMerged;
+    const isPicking = isOpen && Boolean(this.tool.pick);
+    this.navigation.controls.pick = isPicking ? (x, y) => this.tool.pick(x, y) : null;
+    document.body.classList.toggle("picking", isPicking);
     if (isOpen && !isRefused) this.tool.enter?.();
     this.refresh();
   }

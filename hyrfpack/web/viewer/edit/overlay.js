@@ -34,8 +34,7 @@ export class Overlay {
     const shapes = d ? [create("path", { d, class: "outline" }), create("path", { d })] : [];
     for (const at of points) {
       const place = projection.place(at);
-      if (!place) continue;
-      shapes.push(create("circle", { cx: place[0], cy: place[1], r: 6 }));
+      if (place) shapes.push(create("circle", { cx: place[0], cy: place[1], r: 6 }));
     }
     for (const { at, text } of labels) {
       const place = projection.place(at);

@@ -4,7 +4,7 @@ import { frameAxes, rotateBy } from "../../hyrf/rotation.js";
 import { cross, dot, sub, unit } from "../../hyrf/vectors.js";
 import { toPage } from "../camera.js";
 import { toast } from "../notifications.js";
-import { findActive, putAction, roundDirection } from "./actions.js";
+import { findActive, putAction, statedUp } from "./actions.js";
 import { PointPicker } from "./point_picker.js";
 
 const POINTS = 3;
@@ -50,16 +50,14 @@ export class UpTool {
   // Adds the action that states a direction.
   state(direction) {
     const { editor } = this;
-    editor.set(putAction(editor.actions, { option: "up", value: roundDirection(direction) }));
+    editor.set(putAction(editor.actions, statedUp(direction)));
     toast("Up is perpendicular to the ground; orbits turn about it.");
   }
 
   // Turns the scene; the command states up before, so that it does not depend on what the page knows of the file.
   turn(axis) {
     const { editor } = this;
-    if (findActive(editor.actions, "up") < 0) {
-      editor.actions = [...editor.actions, { option: "up", value: roundDirection(editor.placement.up) }];
-    }
+    if (findActive(editor.actions, "up") < 0) editor.actions = [...editor.actions, statedUp(editor.placement.up)];
     editor.set([...editor.actions, { option: "upright", value: axis }]);
     toast(`The saved scene will have +${axis} up. New boxes lie along its axes.`);
   }
