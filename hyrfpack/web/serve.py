@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 from hyrfpack.errors import HyrfError
 
@@ -29,6 +29,7 @@ LOCAL_HOST, LOCAL_HOST_IPV6 = "127.0.0.1", "::1"
 _LOCAL_NAMES = frozenset({LOCAL_HOST, "localhost", f"[{LOCAL_HOST_IPV6}]"})
 # Addresses in other networks by IP version. They are reserved for documentation (RFC 5737, RFC 3849).
 _REMOTE_HOSTS = {4: "192.0.2.1", 6: "2001:db8::1"}
+MAX_PORT = 65_535
 BINARY_CONTENT_TYPE = "application/octet-stream"
 CHUNK_BYTES = 1 << 18  # bounds the memory that sending a large file takes
 SHUTDOWN_POLL_SECONDS = 0.1  # bounds the time that a server in a thread takes to end
@@ -51,7 +52,18 @@ class MemoryFile:
         return io.BytesIO(data), len(data), f'"{number:x}-{len(data):x}"'
 
 
-ServedFiles = Mapping[str, str | os.PathLike[str] | MemoryFile]
+class OpenableFile(Protocol):
+    """A file that is served and is not a file on disk, such as a `MemoryFile`."""
+
+    def open(self) -> tuple[BinaryIO, int, str]:
+        """Return the file for reading, its length in bytes and its ETag.
+
+        Raises:
+            OSError, HyrfError: the file cannot be read.
+        """
+
+
+ServedFiles = Mapping[str, str | os.PathLike[str] | OpenableFile]
 
 
 def serve(
@@ -111,7 +123,8 @@ def serve_in_thread(page: bytes, files: ServedFiles, *, port: int = 0) -> Iterat
         finally:
             server.shutdown()
             thread.join()
-            server.page, server.files = b"", {}  # connections that browsers keep open must get nothing from now on
+            server.is_ended = True  # connections that browsers keep open must get nothing from now on
+            server.page, server.files = b"", {}
 
 
 def _page_address(host: str, server: _Server) -> str:
@@ -138,7 +151,8 @@ def _host_in_address(host: str) -> str:
 
 class _Server(ThreadingHTTPServer):
     page = b""
-    files: Mapping[str, Path | MemoryFile] = {}
+    files: Mapping[str, Path | OpenableFile] = {}
+    is_ended = False
     allowed_hosts: frozenset[str] | None = None  # in the header Host of requests, without the port; None for any
 
     @property
@@ -170,6 +184,11 @@ class _Handler(BaseHTTPRequestHandler):
                 "To open it on another machine, forward its port (ssh -L), or use 'hyrfpack view' with host 0.0.0.0.",
             )
             return
+        if self.server.is_ended:
+            self.send_error(
+                HTTPStatus.SERVICE_UNAVAILABLE, explain="The command that served this page has ended; start it again."
+            )
+            return
         path = self.path.partition("?")[0]
         if path == "/":
             self._send_headers(HTTPStatus.OK, "text/html; charset=utf-8", len(self.server.page))
@@ -187,10 +206,10 @@ class _Handler(BaseHTTPRequestHandler):
         allowed, requested = self.server.allowed_hosts, self.headers.get("Host")
         return allowed is None or requested is None or re.sub(r":\d*$", "", requested.strip()).lower() in allowed
 
-    def _send_file(self, served: Path | MemoryFile) -> None:
+    def _send_file(self, served: Path | OpenableFile) -> None:
         try:
-            file, size, tag = served.open() if isinstance(served, MemoryFile) else _open_on_disk(served)
-        except OSError:
+            file, size, tag = _open_on_disk(served) if isinstance(served, Path) else served.open()
+        except (OSError, HyrfError):
             self.send_error(HTTPStatus.NOT_FOUND, explain="The file that was served here is gone or cannot be read.")
             return
         with file:
@@ -274,6 +293,8 @@ def _create_server(host: str, port: int, page: bytes, files: ServedFiles) -> _Se
             f"'{host}' is not an address to listen at",
             fix=f"use {LOCAL_HOST}, or 0.0.0.0 to allow connections from other machines",
         )
+    if not 0 <= port <= MAX_PORT:
+        raise HyrfError(f"{port} is not a port", fix=f"name one from 1 to {MAX_PORT}, or 0 for any free one")
     try:
         server = Server((host, port), _Handler)
     except (OSError, UnicodeError) as error:  # UnicodeError comes from a malformed host name
@@ -291,5 +312,7 @@ def _create_server(host: str, port: int, page: bytes, files: ServedFiles) -> _Se
         own_names = {_host_in_address(name).lower() for name in (host, str(server.ip_address))}
         server.allowed_hosts = _LOCAL_NAMES | own_names
     server.page = page
-    server.files = {f"/{name}": file if isinstance(file, MemoryFile) else Path(file) for name, file in files.items()}
+    server.files = {
+        f"/{name}": Path(file) if isinstance(file, (str, os.PathLike)) else file for name, file in files.items()
+    }
     return server

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from hyrfpack.errors import HyrfDataError, suggest_command
 from hyrfpack.format import describe_file, find_model
 from hyrfpack.format.run_folder import name_model
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
-from hyrfpack.format.scene_manifest import MANIFEST_NAME
+from hyrfpack.format.scene_manifest import MANIFEST_NAME, SceneFile
 from hyrfpack.ply import MAX_HEADER_BYTES
 from hyrfpack.splats.formats.ply_header import check_gaussians
 from hyrfpack.splats.names import SPLATS_SUFFIXES, is_splats, sog_folder
 from hyrfpack.web.player import MODEL_SUFFIX, encode_player
-from hyrfpack.web.serve import LOCAL_HOST, MemoryFile, ServedFiles, serve
+from hyrfpack.web.serve import LOCAL_HOST, MemoryFile, OpenableFile, ServedFiles, serve
 
 FOLDER_ADDRESS = "scene/"  # of the files of a scene folder
 
@@ -43,14 +46,27 @@ def view(
     serve(page, files, host=host, port=port, open_browser=open_browser, on_ready=on_ready)
 
 
+@dataclass(frozen=True)
+class _ArchivedFile:
+    """A file of a scene in a .zip, which each request reads, so that large scenes are not held in memory."""
+
+    scene: SceneFolder
+    item: SceneFile
+
+    def open(self) -> tuple[BinaryIO, int, str]:
+        """Return the file for reading, its length in bytes and its ETag, after a check of its checksum."""
+        data = self.scene.read_file(self.item)
+        return io.BytesIO(data), len(data), f'"{self.item.crc32}-{len(data):x}"'
+
+
 def _scene_page(path: str | os.PathLike[str]) -> tuple[bytes, ServedFiles]:
     """Return a page that streams a scene folder, and the files of that folder."""
     scene = SceneFolder(path)
     scene.check_files()
-    files: dict[str, Path | MemoryFile] = {FOLDER_ADDRESS + MANIFEST_NAME: MemoryFile(scene.manifest.to_json())}
+    files: dict[str, Path | OpenableFile] = {FOLDER_ADDRESS + MANIFEST_NAME: MemoryFile(scene.manifest.to_json())}
+    is_folder = scene.path.is_dir()
     for item in scene.manifest.files:
-        in_folder = scene.path.is_dir()
-        files[FOLDER_ADDRESS + item.file] = scene.path / item.file if in_folder else MemoryFile(scene.read_file(item))
+        files[FOLDER_ADDRESS + item.file] = scene.path / item.file if is_folder else _ArchivedFile(scene, item)
     title = scene.manifest.title or name_model(scene.path) or "scene"
     return encode_player(title, content=FOLDER_ADDRESS + MANIFEST_NAME, fetches="'self'"), files
 

@@ -30,7 +30,6 @@ from hyrfpack.format import save_model
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.formats import ply
 from hyrfpack.web import view as web_view
-from hyrfpack.web.serve import MemoryFile
 
 GOLDEN_SCENE_FOLDER = Path(__file__).parents[1] / "golden" / "scene"
 GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
@@ -324,10 +323,26 @@ def test_view_serves_the_files_of_a_scene_folder_as_they_are(ending, tmp_path, m
 
     for name in (file.name for file in folder.iterdir()):
         found = served["files"].pop(f"scene/{name}")
-        data = found.open()[0].read() if isinstance(found, MemoryFile) else found.read_bytes()
+        data = found.read_bytes() if isinstance(found, Path) else found.open()[0].read()
         expected = (folder / name).read_bytes()
         assert json.loads(data) == json.loads(expected) if name == "scene.json" else data == expected
     assert not served["files"] and b"scene/scene.json" in served["page"]
+
+
+def test_view_of_a_zipped_scene_reads_a_file_when_it_is_requested(tmp_path, monkeypatch):
+    shutil.make_archive(str(tmp_path / "city"), "zip", GOLDEN_SCENE_FOLDER)
+    served, read = {}, []
+    read_file = web_view.SceneFolder.read_file
+    monkeypatch.setattr(web_view, "serve", lambda page, files, **more: served.update(files))
+    monkeypatch.setattr(
+        web_view.SceneFolder, "read_file", lambda scene, item: read.append(item.file) or read_file(scene, item)
+    )
+
+    web_view.view(tmp_path / "city.zip", open_browser=False, on_ready=print)
+
+    assert read == []
+    file, length, tag = served["scene/shared.hyrf"].open()
+    assert read == ["shared.hyrf"] and len(file.read()) == length and tag.startswith('"')
 
 
 def test_view_names_a_missing_file_of_a_scene_folder(tmp_path):

@@ -310,6 +310,12 @@ def test_an_unusable_host_is_reported_in_one_sentence(host):
         serve(PAGE_HTML, host=host, open_browser=False, on_ready=lambda address: None)
 
 
+@pytest.mark.parametrize("port", [-1, 65_536, 70_000])
+def test_a_number_that_is_no_port_is_refused(port):
+    with pytest.raises(HyrfError, match=f"^{port} is not a port; name one from 1 to 65535, or 0"):
+        serve(PAGE_HTML, port=port, open_browser=False, on_ready=lambda address: None)
+
+
 @pytest.mark.parametrize("host", ["", " "])
 def test_an_empty_host_is_refused(host):
     with pytest.raises(HyrfError, match="not an address to listen at.*127.0.0.1.*0.0.0.0"):
@@ -358,11 +364,18 @@ def test_a_replaced_file_in_memory_has_another_tag_and_is_sent_whole():
 
 def test_serve_in_thread_stops_at_the_end_of_the_block():
     with serving.serve_in_thread(PAGE_HTML, {"scene.hyrf": MemoryFile(FILE_DATA)}) as address:
-        kept = http.client.HTTPConnection("127.0.0.1", port_from_address(address), timeout=20)
-        kept.request("GET", "/scene.hyrf")
-        assert kept.getresponse().read() == FILE_DATA
+        kept = {
+            path: http.client.HTTPConnection("127.0.0.1", port_from_address(address), timeout=20)
+            for path in ("/", "/scene.hyrf")
+        }
+        for connection in kept.values():
+            connection.request("GET", "/scene.hyrf")
+            assert connection.getresponse().read() == FILE_DATA
     with pytest.raises(OSError):
         send_request(port_from_address(address), "/")
-    kept.request("GET", "/scene.hyrf")  # on the connection of the first request
-    assert kept.getresponse().status == 404
-    kept.close()
+    for path, connection in kept.items():
+        connection.request("GET", path)  # on the connection of the first request
+        answer = connection.getresponse()
+        assert (answer.status, answer.headers["Connection"]) == (503, "close")
+        assert b"The command that served this page has ended" in answer.read()
+        connection.close()
