@@ -244,8 +244,13 @@ def encode_readme(title: str, entry: str, index: str, *, element: str | None = N
         index: name of the page that is opened first.
         element: name of a file that <hyrf-viewer> can show; None if its script is not in the folder.
     """
-    line = f'  <script src="hyrf-viewer.js"></script> <hyrf-viewer src="{element}"></hyrf-viewer>\n' if element else ""
-    values = {"title": title, "version": __version__, "entry": entry, "index": index, "element": line}
+    lines = ""
+    if element:
+        lines = (
+            f'  <script src="hyrf-viewer.js"></script> <hyrf-viewer src="{element}"></hyrf-viewer>\n'
+            "  (keep hyrf-viewer.js and player-worker.js together)\n"
+        )
+    values = {"title": title, "version": __version__, "entry": entry, "index": index, "element": lines}
     return fill_template(read_web_file("hosted/README.txt"), values)
 
 

@@ -79,6 +79,7 @@ def test_a_player_folder_has_a_page_the_file_a_poster_and_the_element(model_file
     size = sum(path.stat().st_size for path in folder.iterdir())
     assert report == ExportReport(str(folder), size, 40, native=True)
     readme = (folder / "README.txt").read_text()
+    assert "keep hyrf-viewer.js and player-worker.js together" in readme
     assert readme.startswith("room\n") and "content=URL" in readme and "{{" not in readme
 
 
@@ -193,6 +194,7 @@ def test_a_gallery_lists_its_scenes_and_links_to_its_player(model_file, splats_f
         *("index.html", "player.html", "README.txt", "gallery.css", "player.css", "player.js", "player-worker.js"),
         *("room.hyrf", "room.jpg", "cloud.ply", "cloud.jpg"),
     }
+    assert "hyrf-viewer" not in (tmp_path / "g" / "README.txt").read_text()
     page = (tmp_path / "g" / "index.html").read_text()
     assert '<a href="player.html?content=room.hyrf&amp;poster=room.jpg">room</a>' in page
     assert '<a href="player.html?content=cloud.ply&amp;poster=cloud.jpg">cloud</a>' in page
