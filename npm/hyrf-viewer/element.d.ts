@@ -10,6 +10,7 @@ export interface HyrfViewerElement extends HTMLElement {
   readonly viewer: Viewer | null;
 }
 
+/** Events of the element. With the attribute `frame` it fires only `load` and `error`. */
 export interface HyrfViewerEventMap {
   /** A scene is loaded, for the first time or in a new viewer. */
   load: CustomEvent<string>;

@@ -85,8 +85,11 @@ export interface ViewerEvents {
   ready: { scene: SceneInfo };
   /** The part of the scene that is loaded, 0 to 1. */
   progress: { progress: number };
-  /** Something failed. The message is a sentence for the user. */
-  error: { error: Error };
+  /**
+   * Something failed. The message is a sentence for the user. `option` is "camera" if the scene is loaded and the first
+   * camera is wrong.
+   */
+  error: { error: Error; option?: "camera" };
   /** A frame was drawn from another viewpoint; `viewer.camera` has it. */
   camera: Record<string, never>;
   /** A wheel or a finger was left to the page, see `interaction`. */

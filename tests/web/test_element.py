@@ -62,6 +62,33 @@ def test_changed_attributes_are_followed_without_a_new_viewer(browser: Browser, 
     wait_until(browser, "fired.some(([name, detail]) => name === 'error' && detail.startsWith('The exposure must be'))")
 
 
+@pytest.mark.parametrize(
+    ("name", "wrong", "right"), [("camera", "77", "1"), ("camera", "77", None), ("exposure", "dark", "consistent")]
+)
+@pytest.mark.parametrize("at_first", [False, True])
+def test_the_error_of_an_attribute_is_hidden_when_it_is_corrected(
+    browser: Browser, host: Site, name: str, wrong: str, right: str | None, at_first: bool
+):
+    open_element(browser, host, f'src="cloud.spz" {name}="{wrong}"' if at_first else 'src="cloud.spz"')
+    if not at_first:
+        wait_until(browser, LOADED_JS)
+        browser.evaluate(f"{ELEMENT_JS}.setAttribute('{name}', '{wrong}')")
+    wait_until(browser, f"fired.some(([name, detail]) => name === 'error' && detail.includes('{wrong}'))")
+    assert is_shown(browser, "p")
+    change = f"removeAttribute('{name}')" if right is None else f"setAttribute('{name}', '{right}')"
+    browser.evaluate(f"{ELEMENT_JS}.{change}")
+    wait_until(browser, f"{LOADED_JS} && {ELEMENT_JS}.shadowRoot.querySelector('p').hidden")
+
+
+def test_the_error_of_a_load_stays_when_an_attribute_is_corrected(browser: Browser, host: Site):
+    open_element(browser, host)
+    wait_until(browser, LOADED_JS)
+    browser.evaluate(f"{ELEMENT_JS}.viewer.load('gone.hyrf').catch(() => 0)")
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('camera', '1')")
+    browser.evaluate("new Promise((done) => setTimeout(done, 50))")
+    assert is_shown(browser, "p")
+
+
 def test_an_invalid_exposure_does_not_prevent_the_load_of_another_scene(browser: Browser, host: Site):
     open_element(browser, host)
     wait_until(browser, LOADED_JS)
@@ -136,6 +163,18 @@ def test_an_element_switches_between_page_and_frame(browser: Browser, host: Site
     browser.evaluate(f"fired.length = 0, {ELEMENT_JS}.removeAttribute('frame')")
     wait_until(browser, LOADED_JS)
     assert browser.evaluate(f"!{ELEMENT_JS}.shadowRoot.querySelector('iframe') && {ELEMENT_JS}.viewer.isReady")
+
+
+def test_a_lazy_frame_is_loaded_when_it_comes_near_the_window(browser: Browser, host: Site):
+    host.files["/post.html"] = PAGE.format(
+        body='<div style="height: 30000px"></div><hyrf-viewer src="cloud.spz" frame loading="lazy"></hyrf-viewer>'
+    ).encode()
+    browser.open(f"{host.address}/post.html")
+    wait_until(browser, f"Boolean({ELEMENT_JS}.shadowRoot.querySelector('iframe'))")
+    browser.evaluate("new Promise((done) => setTimeout(done, 300))")
+    assert not any(path.startswith("/index.html") for path, _ in host.requests)
+    browser.evaluate(f"{ELEMENT_JS}.scrollIntoView()")
+    wait_until(browser, LOADED_JS)
 
 
 def test_a_frame_follows_the_camera_without_entries_in_the_history(browser: Browser, host: Site):

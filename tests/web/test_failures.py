@@ -193,6 +193,45 @@ def test_a_sandboxed_frame_says_that_the_sandbox_forbids_the_request(browser: Br
     wait_until(browser, "messages.some(({ hyrf }) => hyrf === 'load')")
 
 
+# ---- a worker that fails after the scene is loaded
+
+WORKER_FAILURES_JS = {
+    "it cannot handle a message": "player.loader.connection.post({ sort: { ticket: 0 } })",
+    "it ends": (
+        "player.loader.connection.shared.worker.dispatchEvent(new ErrorEvent('error', { message: 'no memory' }))"
+    ),
+}
+
+
+@pytest.mark.parametrize("failure", WORKER_FAILURES_JS)
+def test_a_worker_that_fails_is_reported_and_nothing_waits_for_it(browser: Browser, host: Site, failure: str):
+    browser.open(f"{host.address}/index.html?content=cloud.spz")
+    browser.evaluate("hyrfpack.ready.then(() => hyrfpack.player.settled)")
+    browser.evaluate(f"void (({{ player }}) => {{ {WORKER_FAILURES_JS[failure]}; }})(hyrfpack)")
+    message = wait_for_message(browser)
+    assert message.startswith("The player's worker has failed (") and message.endswith("); load the page again.")
+    browser.drag((120, 90), (150, 90))
+    rejected = "(({ message }) => message)"
+    for promise in ("settled", "select([])", "show(hyrfpack.camera())"):
+        assert browser.evaluate(f"hyrfpack.player.{promise}.then(() => '', {rejected})") == message, promise
+    assert not browser.evaluate("hyrfpack.player.loader.busy")
+    drop_file(browser, host.files["/cloud.spz"], "cloud.spz")
+    wait_until(browser, "hyrfpack.player.loaded")
+
+
+def test_an_order_that_a_failed_worker_owes_is_null(browser: Browser, host: Site):
+    browser.open(f"{host.address}/index.html?content=cloud.spz")
+    browser.evaluate("hyrfpack.ready.then(() => hyrfpack.player.settled)")
+    expression = (
+        "(({ loader, scene, ...player }, view) => { const order = loader.sort(view, scene),"
+        " answer = loader.ask({ select: [] }).catch(({ message }) => message);"
+        " loader.connection.shared.worker.dispatchEvent(new ErrorEvent('error', { message: 'no memory' }));"
+        " return Promise.all([order, answer]); })(hyrfpack.player, hyrfpack.player.view())"
+    )
+    order, answer = browser.evaluate(expression)
+    assert order is None and "no memory" in answer
+
+
 # ---- progress
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from web.native_models import run_statements
 from web.pages import (
     Browser,
     camera_json,
@@ -161,6 +162,20 @@ def test_the_strip_shows_what_each_camera_sees_and_moves_there(browser: Browser,
     np.testing.assert_allclose(window_camera(browser).camera_from_world, make_camera(1.5).camera_from_world, atol=1e-9)
     assert find_current_camera(browser) == 1
     assert browser.list_errors() == []
+
+
+def test_a_strip_that_is_reopened_while_it_is_drawn_is_drawn_once(browser: Browser, tmp_path: Path):
+    browser.resize(600, 400)
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+    run_statements(
+        browser,
+        "const { player } = hyrfpack, { preview } = player, button = document.getElementById('views');"
+        " window.previews = 0; player.preview = (views) => { window.previews++; return preview.call(player, views); };"
+        " for (let k = 0; k < 3; k++) button.click();",
+    )
+    wait_until(browser, "document.querySelectorAll('#strip canvas').length === 3")
+    wait_until_still(browser)
+    assert browser.evaluate("previews") == 1
 
 
 def test_a_scene_with_one_camera_has_no_strip(browser: Browser, tmp_path: Path):
@@ -360,6 +375,15 @@ def test_links_are_exact_for_any_unit_and_rotation(tmp_path: Path):
         assert answer["depth"] == pytest.approx(expected["depth"], rel=1e-4) and len(answer["text"]) < 140, answer
 
 
+def test_the_link_of_a_camera_far_from_real_lenses_is_accepted(browser: Browser, tmp_path: Path):
+    ratio = 60_000 / (800 * 600) ** 0.5  # a focal length of 60,000 pixels in a picture of 800 x 600
+    page = make_splats_page(random_splats(50))
+    open_page(browser, tmp_path, page, f"#camera=1000,-50,15,1,0,0,0,{ratio:.6g},5")
+    camera = window_camera(browser)
+    assert camera.fy / (camera.width * camera.height) ** 0.5 == pytest.approx(ratio, rel=1e-4)
+    assert is_hidden(browser, "message")
+
+
 @pytest.fixture
 def served_page() -> Iterator[str]:
     """Serve a page with a scene inside; yield its address."""
@@ -501,6 +525,25 @@ def test_help_describes_only_the_available_input_devices(browser: Browser, tmp_p
     open_page(browser, tmp_path, make_splats_page(random_splats(3)))
     browser.press("?")
     assert browser.evaluate(parts) == ["mouse", "keys"]
+
+
+def test_escape_closes_the_help_alone(browser: Browser, tmp_path: Path):
+    browser.resize(1280, 800)
+    open_page(browser, tmp_path, make_splats_page(random_splats(3)))
+    browser.press("m")
+    browser.press("?")
+    browser.press("Escape")
+    assert is_hidden(browser, "help") and not is_hidden(browser, "settings")
+    browser.press("Escape")
+    assert is_hidden(browser, "settings")
+
+
+def test_text_that_is_dropped_is_left_to_the_browser(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats(3)))
+    assert browser.evaluate(
+        "(() => { const carried = new DataTransfer(); carried.setData('text/plain', '12');"
+        " return dispatchEvent(new DragEvent('drop', { dataTransfer: carried, bubbles: true, cancelable: true })); })()"
+    )
 
 
 def test_the_hint_of_a_first_visit_disappears_with_the_first_input(browser: Browser, tmp_path: Path):

@@ -306,6 +306,21 @@ def test_autorotation_pauses_at_user_input_and_can_be_stopped(browser: Browser, 
     np.testing.assert_array_equal(current_position(browser), stopped)
 
 
+def test_autorotation_waits_while_a_finger_is_down(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)), "?autorotate")
+    browser.touch("touchStart", (120, 90))
+    time.sleep(0.1)
+    turntable = "hyrfpack.player.movers.find((mover) => 'resumesAt' in mover)"
+    browser.evaluate(f"{turntable}.resumesAt = 0")  # as if the finger had been still for 4 s
+    held = current_position(browser)
+    time.sleep(0.3)
+    np.testing.assert_array_equal(current_position(browser), held)
+    browser.touch("touchEnd")
+    browser.evaluate(f"{turntable}.resumesAt = 0, hyrfpack.player.changed()")
+    time.sleep(0.3)
+    assert np.linalg.norm(current_position(browser) - held) > 0.02
+
+
 def test_reduced_motion_prevents_autorotation_until_it_is_requested(browser: Browser, tmp_path: Path):
     browser.prefer(less_motion=True)
     open_page(browser, tmp_path, make_splats_page(random_splats(50)), "?autorotate")

@@ -155,6 +155,16 @@ def test_other_files_and_views_than_the_first_have_no_poster(
     assert name == shown
 
 
+def test_a_page_of_one_file_ignores_the_poster_of_its_address(browser: Browser, tmp_path: Path):
+    camera = make_camera()
+    poster = make_poster(three_balls(camera), camera)
+    (tmp_path / "page.html").write_bytes(make_splats_page(three_balls(camera), poster=poster))
+    with browser.before_every_page(NO_WEBGL_JS):
+        browser.open(f"{(tmp_path / 'page.html').as_uri()}?poster=https://example.org/other.webp")
+        wait_for_message(browser)
+    assert browser.evaluate(f"{POSTER_JS}.src.startsWith('data:') && {POSTER_JS}.naturalWidth > 0")
+
+
 def test_a_file_that_is_opened_while_another_one_loads_removes_the_poster(browser: Browser, host: Site):
     serve_page_with_poster(host)
     del host.files["/some scene.hyrf"]

@@ -217,6 +217,20 @@ def test_in_a_frame_the_wheel_scrolls_the_page_until_the_scene_is_clicked(browse
     assert browser.evaluate("scrollY") == 0
 
 
+def test_in_a_frame_a_tap_that_picks_a_point_lets_fingers_move_the_scene(browser: Browser, host: Site):
+    host.files["/edit.html"] = encode_player("a title", content="some scene.hyrf", editable=True)
+    frame = '<iframe src="edit.html" style="border: 0; width: 240px; height: 300px"></iframe>'
+    host.files["/around.html"] = f'<meta name="viewport" content="width=device-width">{TALL_PAGE_HTML}{frame}'.encode()
+    browser.resize(240, 360, phone=True)
+    browser.open(f"{host.address}/around.html")
+    inside = "document.querySelector('iframe').contentWindow"
+    wait_until(browser, f"{inside}.hyrfpack?.player?.whole")
+    browser.evaluate(f"{inside}.hyrfpack.editor.toggle(true), {inside}.hyrfpack.editor.choose('measure')")
+    browser.touch("touchStart", (120, 60))
+    browser.touch("touchEnd")
+    wait_until(browser, f"{inside}.getComputedStyle({inside}.document.getElementById('view')).touchAction === 'none'")
+
+
 def test_in_a_frame_a_touch_scrolls_the_page_until_the_scene_is_tapped(browser: Browser, host: Site):
     frame = '<iframe src="index.html?content=cloud.spz" style="border: 0; width: 240px; height: 180px"></iframe>'
     host.files["/around.html"] = (

@@ -147,6 +147,16 @@ def test_the_last_snapshot_stays_and_the_page_reports_the_end_of_training(browse
         wait_until_still(browser)
 
 
+def test_a_training_that_ends_before_its_first_step_is_reported(browser: Browser):
+    with open_training_page(browser) as (_, end):
+        wait_until(browser, f"{REMARK_TEXT_JS} !== ''")
+        end()
+        sentence = "The training ended before its first step; see its terminal."
+        wait_until(browser, f"document.getElementById('sentence').textContent === '{sentence}'", seconds=30)
+        assert browser.evaluate("hyrfpack.ready.then(() => '', ({ message }) => message)") == sentence
+        assert browser.evaluate(REMARK_TEXT_JS) == "" and browser.evaluate("document.getElementById('loading').hidden")
+
+
 def test_an_unreadable_first_snapshot_is_reported(browser: Browser):
     with open_training_page(browser, (encode_snapshot(20)[:-40], 1)):
         assert "scene.hyrf cannot be opened" in wait_for_message(browser)

@@ -126,6 +126,13 @@ def test_pick_returns_the_visible_point_in_world_units(browser: Browser, site: S
     assert camera["fy"] * seen[1] / seen[2] + camera["cy"] == pytest.approx(90 * scale, abs=0.6)
 
 
+def test_pick_returns_null_outside_of_the_canvas(browser: Browser, site: Site):
+    open_viewer(browser, site)
+    wait_until(browser, READY_JS)
+    for place in ("-1, 90", "120, -1", "240, 90", "120, 180", "NaN, 90"):
+        assert browser.evaluate(f"viewer.pick({place})") is None, place
+
+
 SOURCES_JS = {
     "a URL": "new URL('some scene.hyrf', document.baseURI)",
     "a Blob": "await (await fetch('some scene.hyrf')).blob()",
@@ -231,6 +238,9 @@ def test_a_screenshot_is_completed_out_of_the_window(browser: Browser, site: Sit
         ("{ container: '#box', exposure: 'dark' }", "exposure must be as-photographed, consistent, not dark"),
         ("{ container: '#box', loading: 'later' }", "loading must be eager, lazy, not later"),
         ("{ container: '#box', interaction: true }", "interaction must be"),
+        ("{ container: '#box', maxGaussians: 0 }", "maxGaussians must be a whole number of at least 1, not 0"),
+        ("{ container: '#box', maxGaussians: NaN }", "maxGaussians must be a whole number of at least 1, not NaN"),
+        ("{ container: '#box', workerUrl: 'http://[' }", "workerUrl must be the address of the worker's script"),
     ],
 )
 def test_invalid_options_are_refused_by_name(browser: Browser, site: Site, options: str, words: str):

@@ -176,6 +176,13 @@ def test_pictures_equal_those_of_webgl_and_of_render(page: Browser, host: Site, 
     assert page.list_errors() == []
 
 
+def test_a_pick_outside_of_the_canvas_is_null_and_webgpu_goes_on(page: Browser, host: Site):
+    load(page, host, encode_model(random_model(300)), kinds="webgpu")
+    assert page.evaluate("[viewers.webgpu.pick(-5, 20), viewers.webgpu.pick(20, 1e5)]") == [None, None]
+    assert is_on_device(page) and page.evaluate("viewers.webgpu.player.lost") is False
+    assert page.list_errors() == []
+
+
 @pytest.mark.parametrize("exposure", ["as-photographed", "consistent"])
 def test_exposures_equal_those_of_webgl(page: Browser, host: Site, exposure: str):
     model = random_model(600)

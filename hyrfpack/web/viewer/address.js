@@ -7,8 +7,9 @@ import { normalizedQuat, quatOf, rowsOf } from "../hyrf/rotation.js";
 
 const LINK_SIDE_PIXELS = 1000; // links do not store a picture's size
 // Limits of the focal length divided by the square root of the picture's area.
-const MIN_FOCAL_RATIO = 0.05;
-const MAX_FOCAL_RATIO = 50;
+// Lenses are far inside; outside, pictures would be a pixel of the scene, or all directions in one pixel.
+const MIN_FOCAL_RATIO = 0.001;
+const MAX_FOCAL_RATIO = 100_000;
 const MAX_TITLE_LETTERS = 200;
 
 // Resolves an address against the page's. Throws an Error with a message for the user if it cannot be fetched.
@@ -49,7 +50,7 @@ export function parseSearch(search) {
   }
   const gaussians = parameters.get("gaussians"), isCount = /^[1-9]\d{0,8}$/.test(gaussians ?? "1");
   if (!isCount) {
-    wrong.push(`The number of Gaussians in the address must be a whole number, not ${shortenForMessage(gaussians)}.`);
+    wrong.push(`The number of Gaussians in the address must be 1 to 999,999,999, not ${shortenForMessage(gaussians)}.`);
   }
   const readFlag = (name) => {
     return parameters.has(name) && !["0", "false", "no", "off"].includes(parameters.get(name).toLowerCase());

@@ -144,18 +144,16 @@ export class Controls {
     const tap = event.type === "pointerup" && near(this.start, MAX_TAP_MOVE_PIXELS, maxTapMs);
     this.start = null;
     this.acted();
+    const { tapped } = this;
+    this.tapped = null;
     if (!tap) {
-      this.tapped = null;
       if (!this.engaged && event.pointerType !== "mouse") this.ignored("finger");
-    } else if (this.pick) {
-      this.pick(x, y);
-    } else if (near(this.tapped, MAX_DOUBLE_TAP_DISTANCE_PIXELS, MAX_TAP_MS)) {
-      this.tapped = null;
-      this.approach(x, y);
-    } else {
-      this.engage(true);
-      this.tapped = { x, y, time };
+      return;
     }
+    this.engage(true);
+    if (this.pick) this.pick(x, y);
+    else if (near(tapped, MAX_DOUBLE_TAP_DISTANCE_PIXELS, MAX_TAP_MS)) this.approach(x, y);
+    else this.tapped = { x, y, time };
   }
 
   wheel(event) {
@@ -175,9 +173,9 @@ export class Controls {
 
   key(event) {
     const key = keyName(event), moves = FLY_AXES[key] || LOOK_SIGNS[key] || ZOOM_SIGNS[key];
-    const typing = "select, dialog, textarea, input:not([type='range'], [type='checkbox'])";
-    const isForInput = event.target.closest?.(LOOK_SIGNS[key] ? "input, select, dialog, textarea" : typing);
-    if (event.ctrlKey || event.metaKey || event.altKey || (isForInput && key !== "Escape")) return;
+    const inputs = LOOK_SIGNS[key] ? "input" : "input:not([type='range'], [type='checkbox'])";
+    const users = key === "Escape" ? "dialog" : `dialog, select, textarea, ${inputs}`; // elements that use the key
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest?.(users)) return;
     if (moves || key === "Shift") {
       this.held.set(event.code, key);
       if (LOOK_SIGNS[key]) event.preventDefault();

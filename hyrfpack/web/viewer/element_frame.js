@@ -4,7 +4,9 @@
 
 import { addressBesideScript } from "./script_address.js";
 
-export const FRAME_ATTRIBUTES = ["src", "camera", "poster", "title", "exposure", "autorotate", "noui", "player"];
+export const FRAME_ATTRIBUTES = [
+  "src", "camera", "poster", "title", "exposure", "autorotate", "noui", "player", "loading",
+];
 const ANSWER_MS = 3000; // a player answers long before its page has loaded
 const FIX_TEXT = 'set its attribute player to the address of the player, such as player="player/index.html".';
 
@@ -64,6 +66,7 @@ export class FrameView {
     this.isAnswered = false;
     this.frame = document.createElement("iframe");
     this.frame.allow = "fullscreen; clipboard-write; web-share";
+    this.frame.loading = this.element.getAttribute("loading") ?? "eager";
     this.frame.src = href;
     this.frame.onload = () => {
       if (this.isMoved && this.frame.src !== this.address) this.replaceAddress(); // with that of the newest camera

@@ -25,6 +25,7 @@ export class InlineView {
     this.isEager = false; // whether a pending scene is also shown far from the window
     this.cameraText = null; // the camera of the scene before it was suspended
     this.isFailed = false; // whether the message is an error
+    this.wrongAttribute = null; // the name of the attribute whose value is the error, null for another error
     this.isLost = false; // whether the browser has taken the graphics context away
     const make = (name, attributes = {}) => {
       const made = document.createElement(name);
@@ -99,17 +100,21 @@ export class InlineView {
       this.viewer.firstCamera = now.camera;
       this.viewer.load(now.src).catch(() => {}); // the event has reported it
     } else if (isNew("camera")) {
-      this.attempt(() => this.moveTo(now.camera));
+      this.attempt("camera", () => this.moveTo(now.camera));
     }
-    if (isNew("exposure")) this.attempt(() => (this.viewer.exposure = now.exposure ?? AS_PHOTOGRAPHED));
+    if (isNew("exposure")) this.attempt("exposure", () => (this.viewer.exposure = now.exposure ?? AS_PHOTOGRAPHED));
   }
 
-  // Does what an attribute asks for, and shows the error if its value is invalid.
-  attempt(follow) {
+  // Does what an attribute asks for. Shows the error if its value is invalid, and hides that of its value before.
+  attempt(name, follow) {
     try {
       follow();
+      if (this.isFailed && this.wrongAttribute === name) {
+        this.isFailed = false;
+        this.message.hidden = true;
+      }
     } catch (error) {
-      this.fail(error);
+      this.fail(error, name);
     }
   }
 
@@ -148,7 +153,7 @@ export class InlineView {
       this.bar.hidden = true;
       this.element.fireEvent("load", "");
     });
-    this.viewer.on("error", ({ error }) => this.fail(error));
+    this.viewer.on("error", ({ error, option }) => this.fail(error, option));
     this.watchContext(this.viewer);
     this.viewer.on("ignored", ({ kind }) => this.hint(HINTS[kind]));
   }
@@ -173,9 +178,9 @@ export class InlineView {
     if (address) this.poster.src = address;
   }
 
-  // Shows an error until the next scene is loaded.
-  fail({ message }) {
-    this.isFailed = true;
+  // Shows an error until the next scene is loaded, or until the attribute whose value is wrong is corrected.
+  fail({ message }, wrongAttribute = null) {
+    Object.assign(this, { isFailed: true, wrongAttribute });
     this.bar.hidden = true;
     this.showMessage(message);
     this.element.fireEvent("error", message);

@@ -16,12 +16,14 @@ export class Loader {
   // `content(message)` is called with each content that was read (see worker_tasks.js), one after the other. Its
   // promise resolves to true if the content is shown. `progress({what, part})` is called with the fraction `part` of
   // the step `what`.
+  // `failed(error, isReported)` is called when the worker has failed; `isReported` if a promise is rejected as well.
   // `workerAddress` is that of the worker's script, or null for the embedded one.
-  constructor({ content, progress, workerAddress = null }) {
+  constructor({ content, progress, failed, workerAddress = null }) {
     if (!window.DecompressionStream) {
       throw new StartError("This browser is too old to unpack the scene; use a newer one.");
     }
-    Object.assign(this, { content, progress });
+    Object.assign(this, { content, progress, failed });
+    this.failure = null; // the error of the worker
     this.ticket = 0;
     this.waiting = new Map(); // ticket -> the function that resolves the promise of its order
     this.asked = new Map(); // ticket -> {resolve, reject} of the promise of its answer
@@ -31,7 +33,7 @@ export class Loader {
       : NO_EMBEDDED_WORKER_TEXT;
     const receive = (message) => this.receive(message);
     // An error without a message means that the worker's script was not allowed to run.
-    const fail = (message) => this.fail(message ? new Error(message) : new StartError(refusal));
+    const fail = (message) => this.breakDown(message ? failureOf(message) : new StartError(refusal));
     try {
       this.connection = new Connection(workerAddress, receive, fail);
     } catch {
@@ -50,6 +52,7 @@ export class Loader {
     if (message.order) this.sorted(message.order);
     if (message.answer) this.answered(message.answer);
     if (message.error) this.fail(new Error(message.error));
+    if (message.failure) this.breakDown(failureOf(message.failure));
   }
 
   // Returns an object that evaluates and draws the models of a content, or null for the player's own.
@@ -69,6 +72,7 @@ export class Loader {
 
   // Returns a promise that resolves when all available content is shown.
   expect() {
+    if (this.failure) return Promise.reject(this.failure);
     return new Promise((resolve, reject) => this.pending.push({ resolve, reject }));
   }
 
@@ -76,6 +80,23 @@ export class Loader {
   fail(error) {
     this.broken = true;
     this.pending.splice(0).forEach(({ reject }) => reject(error));
+  }
+
+  // Handles a failure of the worker: it sorts nothing and answers nothing any more.
+  breakDown(error) {
+    const isReported = this.pending.length + this.asked.size > 0;
+    this.failure = error;
+    this.end(error);
+    this.failed(error, isReported);
+  }
+
+  // Ends what waits for the worker. Rejects the promises of `ask` by `askError`.
+  end(error, askError = error) {
+    this.fail(error);
+    for (const answer of this.waiting.values()) answer(null);
+    this.waiting.clear();
+    for (const { reject } of this.asked.values()) reject(askError);
+    this.asked.clear();
   }
 
   // Reads a file from an async iterable of its bytes, which are transferred to the worker. `length` is in bytes, and 0
@@ -125,7 +146,7 @@ export class Loader {
   }
 
   // Sorts the splats for a view of a scene. Returns a promise of {order, drawn}, or of null if another content has been
-  // selected meanwhile. The caller passes the order to `reuse` after copying it.
+  // selected meanwhile or the worker has failed. The caller passes the order to `reuse` after copying it.
   sort(view, { near, sortNear = near, tolerance }) {
     // The frustum is enlarged, so that no splats are missing at the edges until the next order arrives.
     const sides = frustumPlanes(view, 1 + tolerance), row = [...view.rows[2], view.translation[2]];
@@ -142,6 +163,7 @@ export class Loader {
 
   // Asks the worker a question (see worker_tasks.js). Returns a promise of the answer.
   ask(question) {
+    if (this.failure) return Promise.reject(this.failure);
     const ticket = ++this.ticket;
     this.connection.post({ ask: { ticket, ...question } });
     return new Promise((resolve, reject) => this.asked.set(ticket, { resolve, reject }));
@@ -161,10 +183,8 @@ export class Loader {
 
   dispose() {
     this.connection.close();
-    this.fail(new SupersededError("another file was opened instead"));
-    for (const answer of this.waiting.values()) answer(null);
-    this.waiting.clear();
-    for (const { reject } of this.asked.values()) reject(new SupersededError());
-    this.asked.clear();
+    this.end(new SupersededError("another file was opened instead"), new SupersededError());
   }
 }
+
+const failureOf = (reason) => new Error(`The player's worker has failed (${reason}); load the page again.`);

@@ -125,14 +125,15 @@ function blendablePose({ position, rows, focal, pace, target }) {
 
 // Turns the eye slowly about its target while the user makes no input.
 export class Turntable {
-  constructor(player) {
-    this.player = player;
+  // `isHeld()` returns whether a key or a pointer is down.
+  constructor(player, isHeld) {
+    Object.assign(this, { player, isHeld });
     this.on = false;
     this.resumesAt = 0; // the time in ms at which the turn resumes
   }
 
   get active() {
-    return this.on && performance.now() >= this.resumesAt;
+    return this.on && !this.isHeld() && performance.now() >= this.resumesAt;
   }
 
   turn(on) {

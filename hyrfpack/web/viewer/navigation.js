@@ -13,7 +13,7 @@ export class Navigation {
     Object.assign(this, { player, picked });
     this.damper = new Damper(player);
     this.glide = new Glide(player);
-    this.turntable = new Turntable(player);
+    this.turntable = new Turntable(player, () => this.controls?.active);
     player.movers.push(this.damper, this.glide, this.turntable);
     this.controls = null;
     if (!keyTarget) return;

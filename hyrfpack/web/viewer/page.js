@@ -25,10 +25,11 @@ const IGNORED_TEXTS = {
 function showPoster(parameters, embedded, served) {
   const { isOwn, stage } = findFirstFile(served, parameters), named = namedCamera(parameters);
   const isFirstView = named === null || named === "1", picture = element("poster");
-  if (!parameters.poster && !(isFirstView && (embedded || isOwn))) picture?.remove();
-  else if (parameters.poster || picture) {
+  const address = embedded ? null : parameters.poster; // the policy of a page of one file forbids other pictures
+  if (!address && !(isFirstView && (embedded || isOwn))) picture?.remove();
+  else if (address || picture) {
     const image = picture ?? Object.assign(new Image(), { id: "poster", alt: "" });
-    if (parameters.poster) image.src = parameters.poster;
+    if (address) image.src = address;
     document.body.append(image);
     return new Poster(image, element("view"), isFirstView ? (embedded ?? stage)?.cameras[0] : null);
   }
@@ -196,17 +197,15 @@ function start({ startEditing = () => {}, streaming = null, watchTraining }) {
     target.value = ""; // so that choosing the same file again fires an event
   };
   for (const button of document.querySelectorAll(".choose")) button.onclick = () => element("file").click();
-  addEventListener("dragover", (event) => {
-    if (!event.dataTransfer.types.includes("Files")) return;
-    event.preventDefault();
-    document.body.classList.add("dropping");
-  });
+  for (const type of ["dragover", "drop"]) {
+    addEventListener(type, (event) => {
+      if (!event.dataTransfer.types.includes("Files")) return; // text may be dropped into fields
+      event.preventDefault();
+      document.body.classList.toggle("dropping", type === "dragover");
+      if (type === "drop") openFile(event.dataTransfer.files[0]);
+    });
+  }
   addEventListener("dragleave", ({ relatedTarget }) => relatedTarget ?? document.body.classList.remove("dropping"));
-  addEventListener("drop", (event) => {
-    event.preventDefault();
-    document.body.classList.remove("dropping");
-    openFile(event.dataTransfer.files[0]);
-  });
   addEventListener("hashchange", () => followCamera(parseHash(location.hash), true));
   element("dismiss").onclick = element("enough").onclick = dismiss;
   if (parameters.autorotate && !prefersReducedMotion()) setTurning(true);

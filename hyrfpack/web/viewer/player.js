@@ -152,23 +152,27 @@ export class Player extends EventTarget {
   async receive({
     name = "", scene = null, stage = null, stream, address = null, picture = null, update = false, origin = null,
   }) {
-    // The page's own file is kept, and shown if this one fails.
-    if (this.loader || this.previous) this.next?.dispose();
-    else this.previous = this.next;
     const isStreamed = address !== null && this.streaming?.isManifest(address);
-    const loader = new (isStreamed ? this.streaming.StreamLoader : Loader)({
-      content: (content) => this.install(loader, content),
-      progress: ({ what, part }) => this.progress(loader, what, part),
-      workerAddress: this.workerAddress,
-      player: this,
-    });
-    Object.assign(loader, { picture, part: 0, scene, remark: "", update, origin });
-    this.next = loader;
-    this.failure = null;
+    let loader = null;
     try {
+      loader = new (isStreamed ? this.streaming.StreamLoader : Loader)({
+        content: (content) => this.install(loader, content),
+        progress: ({ what, part }) => this.progress(loader, what, part),
+        failed: (error, isReported) => this.breakDown(loader, error, isReported),
+        workerAddress: this.workerAddress,
+        player: this,
+      });
+      // The page's own file is kept, and shown if this one fails.
+      if (this.loader || this.previous) this.next?.dispose();
+      else this.previous = this.next;
+      Object.assign(loader, { picture, part: 0, scene, remark: "", update, origin });
+      this.next = loader;
+      this.failure = null;
       await loader.read({ name, scene, stage, plain: scene?.plain ?? false, stream, address });
     } catch (error) {
-      if (this.loader === loader) {
+      if (!loader) {
+        stream.cancel?.();
+      } else if (this.loader === loader) {
         this.whole = true; // no more of the file will arrive
         this.redraw();
       } else {
@@ -184,6 +188,15 @@ export class Player extends EventTarget {
     if (this.loaded || this.next) return;
     this.failure = error;
     for (const { reject } of this.onIdle.splice(0)) reject(error);
+  }
+
+  // Stops to draw a file whose worker has failed. What the canvas shows stays there.
+  breakDown(loader, error, isReported) {
+    if (loader === this.loader) {
+      this.loaded = false;
+      this.giveUp(error);
+    }
+    if (!isReported) this.emit("failed", error);
   }
 
   // Discards a loader whose file cannot be shown.
@@ -631,10 +644,12 @@ export class Player extends EventTarget {
     this.changed();
   }
 
-  // Returns the visible point (page's units) at a position of the canvas (CSS pixels), or null if there is none.
+  // Returns the visible point (page's units) at a position of the canvas (CSS pixels), or null if there is none,
+  // such as outside of the canvas.
   findPoint(x, y) {
-    if (!this.loaded) return null;
-    const { width, height, clientWidth, clientHeight } = this.canvas, view = this.view();
+    const { width, height, clientWidth, clientHeight } = this.canvas;
+    if (!this.loaded || !(x >= 0 && y >= 0 && x < clientWidth && y < clientHeight)) return null;
+    const view = this.view();
     const [across, down] = [(x * width) / clientWidth, (y * height) / clientHeight];
     const depth = this.renderer.pick(view, across, down, this.eye.depth);
     this.redraw(); // the pick has changed the projection
@@ -690,7 +705,7 @@ export class Player extends EventTarget {
   // Moves the eye to a camera in world units and draws its picture. Returns its RGB bytes, top row first. Throws an
   // Error with a message for the user if that is impossible. An invalid camera does not move the eye.
   async show(camera) {
-    if (!this.loaded) throw new Error(DEVICE_LOST_TEXT);
+    if (!this.loaded) throw this.failure ?? new Error(DEVICE_LOST_TEXT);
     const view = viewOf(camera, this.scene), { content } = this.renderer;
     this.renderer.check(view);
     this.eye.setView(view);

@@ -8,7 +8,7 @@ const WIDTH_PIXELS = 96, HEIGHT_PIXELS = 72; // of a picture
 export class Strip {
   // `choose(number)` is called with the index of the camera that the user chose.
   constructor(player, choose) {
-    Object.assign(this, { player, choose, strip: element("strip"), drawn: null });
+    Object.assign(this, { player, choose, strip: element("strip"), drawn: null, drawing: null });
     player.addEventListener("camera", () => this.mark());
   }
 
@@ -40,14 +40,14 @@ export class Strip {
     this.strip.hidden = !isOpen;
     element("views").setAttribute("aria-expanded", String(isOpen));
     this.mark();
-    this.draw().catch(fail);
+    this.drawing ??= this.draw().catch(fail).finally(() => (this.drawing = null));
   }
 
   // Draws the pictures of the scene's cameras if they are visible and not drawn yet, while the eye stands still.
   async draw() {
-    const { player, strip } = this, { cameras } = player;
-    const isWanted = () => !strip.hidden && this.drawn !== cameras && player.cameras === cameras;
-    while (isWanted()) {
+    const { player, strip } = this;
+    while (!strip.hidden && this.drawn !== player.cameras) {
+      const { cameras } = player, isWanted = () => !strip.hidden && player.cameras === cameras;
       if (!(await player.settled.then(() => true, () => false))) return; // the scene cannot be shown
       const pictures = isWanted() && (await player.preview(cameras.map(coveringView)));
       if (!pictures || !isWanted()) continue;

@@ -4,7 +4,8 @@ import { remark } from "./notifications.js";
 import { fetchedFile } from "./source.js";
 
 const NOT_STARTED_TEXT = "The training has not taken its first step yet.";
-const TRAINING_ENDED_TEXT = "The training does not answer any more; this is its last snapshot.";
+const TRAINING_ENDED_TEXT = "The training does not answer any more; this is the last snapshot that the page received.";
+const NEVER_STARTED_TEXT = "The training ended before its first step; see its terminal.";
 
 const REQUEST_INTERVAL_MS = 2000;
 const WAIT_PER_LOAD_RATIO = 3; // the wait after a snapshot is at least this many times its loading time
@@ -73,6 +74,10 @@ export function watchTraining(opener, address, updates, sceneTitle) {
       panel.setTitle(player.scene, title);
     };
     const ended = followTraining(updates, { show, waiting: () => remark(NOT_STARTED_TEXT), isWanted });
-    ended.then(() => isWanted() && remark(TRAINING_ENDED_TEXT), failed);
+    ended.then(() => {
+      if (!isWanted()) return;
+      remark(isShown ? TRAINING_ENDED_TEXT : "");
+      if (!isShown) failed(new Error(NEVER_STARTED_TEXT));
+    }, failed);
   });
 }

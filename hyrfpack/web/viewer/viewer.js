@@ -33,13 +33,16 @@ class Viewer {
     checkChoice("exposure", exposure, EXPOSURES);
     checkChoice("interaction", interaction, INTERACTIONS);
     checkChoice("loading", loading, LOADINGS);
+    if (maxGaussians !== null && !(Number.isInteger(maxGaussians) && maxGaussians > 0)) {
+      throw new Error(`maxGaussians must be a whole number of at least 1, not ${String(maxGaussians)}.`);
+    }
     if (typeof renderer !== "function") throw new Error(RENDERER_TEXT);
+    const workerAddress = workerUrl && resolveWorker(workerUrl);
     this.canvas = document.createElement("canvas");
     Object.assign(this.canvas.style, CANVAS_STYLE);
     this.canvas.tabIndex = interaction === "none" ? -1 : 0;
     this.canvas.setAttribute("role", interaction === "none" ? "img" : "application");
     this.canvas.setAttribute("aria-label", title);
-    const workerAddress = workerUrl && new URL(workerUrl, document.baseURI).href;
     const playerOptions = { workerAddress, streaming: STREAMING, maxGaussians, rendererClass: renderer };
     this.player = new Player(this.canvas, playerOptions);
     this.player.exposure = exposure;
@@ -101,7 +104,7 @@ class Viewer {
       try {
         this.camera = camera;
       } catch (error) {
-        this.emit("error", { error });
+        this.emit("error", { error, option: "camera" });
       }
     });
   }
@@ -253,6 +256,14 @@ const newAbortError = () => new DOMException("Another scene was loaded instead."
 // Throws an Error if a value is not one of the allowed ones.
 function checkChoice(name, value, allowed) {
   if (!allowed.includes(value)) throw new Error(`${name} must be ${allowed.join(", ")}, not ${String(value)}.`);
+}
+
+function resolveWorker(address) {
+  try {
+    return new URL(address, document.baseURI).href;
+  } catch {
+    throw new Error(`workerUrl must be the address of the worker's script, not ${String(address)}.`);
+  }
 }
 
 // Returns {number} or {view, depth} of a camera: its index from 0, its text in a link, or a camera in world units.

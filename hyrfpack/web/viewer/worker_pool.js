@@ -10,8 +10,9 @@ let lastNumber = 0;
 // Exchanges messages with one reader of a worker.
 export class Connection {
   // Starts a worker, or shares one. `address` is that of the worker's script, or null for the embedded script.
-  // `receive(message)` is called with each message of the reader. `fail(message)` is called if the worker's script
-  // cannot run, with "" if it was not allowed to run. Throws an Error if the browser refuses to start a worker.
+  // `receive(message)` is called with each message of the reader. `fail(message)` is called when the worker has failed,
+  // with "" if its script was not allowed to run; the connection is closed then. Throws an Error if the browser refuses
+  // to start a worker.
   constructor(address, receive, fail) {
     Object.assign(this, { receive, fail });
     this.number = ++lastNumber;
@@ -49,7 +50,10 @@ function startWorker(address) {
   const shared = { worker: createWorker(address), address, connections: new Map() };
   shared.worker.onmessage = ({ data: { reader, ...message } }) => shared.connections.get(reader)?.receive(message);
   shared.worker.onerror = ({ message }) => {
-    for (const connection of [...shared.connections.values()]) connection.fail(message ?? "");
+    for (const connection of [...shared.connections.values()]) {
+      connection.close();
+      connection.fail(message ?? "");
+    }
   };
   pool.push(shared);
   return shared;

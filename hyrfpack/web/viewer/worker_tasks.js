@@ -21,6 +21,7 @@
 //     {order: {ticket, number, order, drawn}}
 //     {answer: {ticket, value | error}}      to `ask`: the numbers that are left after each selection, or the file
 //     {error}                                the reason, as soon as it is certain that the file cannot be read
+//     {failure}                              the reason why another message could not be handled
 
 import { fitHarmonics } from "../hyrf/harmonics.js";
 import { read, readParts } from "../hyrf/index.js";
@@ -48,7 +49,11 @@ export function startWorker(readSplats, Stream = null) {
     }
     const service = services.get(reader);
     if (message.close) services.delete(reader);
-    service.handle(message);
+    try {
+      service.handle(message);
+    } catch (error) { // other readers go on
+      service.post({ failure: describeError(error) });
+    }
   };
 }
 
@@ -80,8 +85,8 @@ class Service {
   }
 
   async answer({ ticket, select, decode }) {
-    const bytes = this.reader.file.gather(), { kept } = this.sorter;
     try {
+      const bytes = this.reader.file.gather(), { kept } = this.sorter;
       const value = select ? await this.select(select) : decode ? { model: await read(bytes), kept } : bytes;
       this.post({ answer: { ticket, value } });
     } catch (error) {
