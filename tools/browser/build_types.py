@@ -9,6 +9,7 @@ the same bytes.
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import tempfile
@@ -18,6 +19,7 @@ from tools.browser.build_player import PROGRAMS_FOLDER, REPOSITORY_ROOT
 
 HYRF_FOLDER = REPOSITORY_ROOT / "hyrfpack" / "web" / "hyrf"
 TYPES_FOLDER = HYRF_FOLDER / "types"
+MODULE_PATTERN = re.compile(r'"\./(\w+\.js)"')
 TSC_OPTIONS = (
     "--ignoreConfig --declaration --emitDeclarationOnly --allowJs --checkJs --strict --target es2022 "
     "--module nodenext --lib es2022,dom"
@@ -31,7 +33,7 @@ def list_public_modules() -> list[str]:
 
 
 def build_types() -> dict[str, str]:
-    """Return the declarations of the public modules, and of all that these import, by file name.
+    """Return the declarations of the public modules, and those to which these refer, by file name.
 
     Raises:
         SystemExit: TypeScript is not installed, or it refuses a module; it has printed the reason.
@@ -43,7 +45,19 @@ def build_types() -> dict[str, str]:
         command = [program, *TSC_OPTIONS, "--types", "", "--outDir", folder, *list_public_modules()]
         if subprocess.run(command, cwd=HYRF_FOLDER).returncode:
             raise SystemExit("the type declarations of hyrf.js could not be written")
-        return {path.name: path.read_text("utf-8") for path in sorted(Path(folder).iterdir())}
+        declarations = {path.name: path.read_text("utf-8") for path in sorted(Path(folder).iterdir())}
+    # The compiler also writes those of modules that only implementations import.
+    needed: set[str] = set()
+    found = {declaration_name(module) for module in list_public_modules()}
+    while found - needed:
+        needed |= found
+        found = {declaration_name(name) for file in needed for name in MODULE_PATTERN.findall(declarations[file])}
+    return {name: text for name, text in declarations.items() if name in needed}
+
+
+def declaration_name(module: str) -> str:
+    """Return the file name of the declarations of a module."""
+    return f"{module.removesuffix('.js')}.d.ts"
 
 
 def main() -> None:
