@@ -125,6 +125,27 @@ def file_with_deepest_metadata() -> bytes:
     return assemble_file(text, zero_payloads(meta), section_shapes(meta), zlib.compress(text, 9))
 
 
+def file_with_empty_deflate_blocks(text_bytes: int, added_bytes: int) -> bytes:
+    """Return a file whose deflated metadata begins with empty blocks of fixed codes.
+
+    Args:
+        text_bytes: length of the metadata's text, which spaces at its end fill up.
+        added_bytes: by how many bytes its zlib stream is longer than the text.
+    """
+    meta = make_meta(0)
+    text = metadata_json(meta).ljust(text_bytes)
+    four_blocks = sum(0b0000000_01_0 << 10 * k for k in range(4)).to_bytes(5, "little")
+    for _ in range(5):  # four empty blocks fill five bytes
+        deflated = zlib.compress(text, 9)
+        count, rest = divmod(len(text) + added_bytes - len(deflated), len(four_blocks))
+        if not rest:
+            break
+        text += b" "
+    deflated = deflated[:2] + four_blocks * count + deflated[2:]
+    assert len(deflated) == len(text) + added_bytes
+    return assemble_file(text, zero_payloads(meta), section_shapes(meta), deflated)
+
+
 def file_with_empty_payloads(codec: int) -> bytes:
     """Return a file that declares the most Gaussians in `codec`, with payloads of zero bytes."""
     meta = make_meta(EXTRA_GAUSSIANS - 100)

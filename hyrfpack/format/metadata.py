@@ -20,6 +20,8 @@ from hyrfpack.version import __version__
 CODEC_JSON = 0
 CODEC_DEFLATED = 5
 MAX_METADATA_BYTES = 1 << 20
+# zlib adds less to text that it cannot compress. The limit bounds the time that a stream of empty blocks can take.
+MAX_DEFLATE_OVERHEAD_BYTES = 1024
 MAX_NESTING_DEPTH = 64  # limits the recursion of functions that walk the objects and lists
 INTEGER_LIMIT = 1 << 63
 # A file may declare this many Gaussians for each of its bytes, plus a constant, because equal Gaussians take no bytes.
@@ -139,7 +141,7 @@ def _parse_metadata(container: Container) -> Metadata:
             f"{MAX_METADATA_BYTES} bytes in codecs {CODEC_JSON} and {CODEC_DEFLATED} can be read",
             fix="the file is damaged or newer than this hyrfpack, update hyrfpack or write the file again",
         )
-    if entry is not None and entry.codec == CODEC_JSON and entry.raw_length != entry.length:
+    if entry is not None and not _is_stored_length_plausible(entry.codec, entry.length, entry.raw_length):
         raise HyrfFormatError(
             f"{name}: the metadata has {entry.length} bytes and says it decodes to {entry.raw_length}",
             fix="the file is damaged, write it again",
@@ -185,6 +187,10 @@ def _parse_metadata(container: Container) -> Metadata:
     except ValueError as error:
         raise HyrfFormatError(f"{name}: the metadata is not valid: {error}", fix="write the file again") from error
     return Metadata(**values)
+
+
+def _is_stored_length_plausible(codec: int, stored: int, raw: int) -> bool:
+    return stored == raw if codec == CODEC_JSON else stored <= raw + MAX_DEFLATE_OVERHEAD_BYTES
 
 
 def _inflate(data: bytes, length: int, name: str) -> bytes:

@@ -321,6 +321,7 @@ def read_metadata(section: Section) -> dict[str, Any]:
     require(section.codec in (0, 5) and section.raw_length <= 2**20, "META: unknown codec or too long")
     text = section.read()
     if section.codec == 5:
+        require(len(text) <= section.raw_length + 1024, "META: too many stored bytes")
         inflate = zlib.decompressobj()
         text = inflate.decompress(text, section.raw_length + 1)
         require(inflate.eof and not inflate.unused_data, "META: bad deflate stream")

@@ -62,7 +62,8 @@ const decodeChannel = (data, { classes, count }) => {
   const view = new DataView(data.buffer, data.byteOffset, data.length);
   const mean = view.getFloat32(0, true), weight = data[4], classCount = data[9];
   const start = CHANNEL_HEADER_BYTES + classCount, size = start + view.getUint32(5, true);
-  assertValid(Math.abs(mean) <= MAX_ABS_MEAN && weight <= MAX_PREDICTION_WEIGHT, "the header of a channel cannot be");
+  const isKnown = Math.abs(mean) <= MAX_ABS_MEAN && weight <= MAX_PREDICTION_WEIGHT;
+  assertValid(isKnown, "the header of a channel has invalid values");
   assertValid(size <= data.length, "it ends within a channel");
   let largestClass = 0;
   for (let i = 0; i < count; i++) if (classes[i] > largestClass) largestClass = classes[i];

@@ -6,7 +6,7 @@ import { assertValid } from "./errors.js";
  * An exposure map. `box`: minimum and maximum coordinates of the training cameras (6 numbers, local units); `lengths`:
  * the kernel's length scales for positions (local units) and for directions (unit vectors); `mean`: log gains far from
  * all centers (3 numbers); `limits`: minimum and maximum log gains (6 numbers). Each center has a position in local
- * units, a viewing direction of unit length, and the 3 log gains that the kernel weights.
+ * units, a viewing direction of any length, and the 3 log gains that the kernel weights.
  * @typedef {{
  *   box: Float32Array, lengths: Float32Array, mean: Float32Array, limits: Float32Array,
  *   centers: {position: number[], direction: number[], weight: number[]}[],

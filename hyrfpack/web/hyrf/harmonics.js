@@ -65,7 +65,7 @@ const COARSE_TIME_RATIO = 0.1; // the measured share of the time until the coars
  *   model is empty: then all Gaussians are present, with their colours from the first viewpoint. An exception that
  *   `report` throws ends the conversion.
  * @returns {Promise<Splats>}
- * @throws {HyrfFormatError} a resulting number is NaN or infinite
+ * @throws {HyrfFormatError} a shape or a colour is NaN or infinite
  */
 export async function fitHarmonics(model, viewpoints, degree, report = () => {}) {
   const { count, config } = model, { center, scale, rotation } = config.frame;

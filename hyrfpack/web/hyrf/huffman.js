@@ -27,7 +27,7 @@ export const decodeHuffman = (data, count) => {
   const symbolBytes = data[24], sizeBytes = data[25];
   const areWidthsKnown = (symbolBytes === 1 || symbolBytes === 2) && (sizeBytes === 2 || sizeBytes === 4);
   const isKnown = areWidthsKnown && leaves <= 256 ** symbolBytes + 1;
-  assertValid(isKnown && endMark <= Math.max(leaves - 1, 0), "the header of a Huffman stream cannot be");
+  assertValid(isKnown && endMark <= Math.max(leaves - 1, 0), "the header of a Huffman stream has invalid values");
   assertValid(readUint64(view, 0) === count, `a Huffman stream codes another number of symbols than ${count}`);
   const isPossible = count <= 8 * packedBytes && count > 0 === packedBytes > 0 && (leaves > 0 || count === 0);
   assertValid(isPossible, "a Huffman stream codes more symbols than its bytes can");

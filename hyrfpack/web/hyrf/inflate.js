@@ -1,6 +1,6 @@
 // Decompresses zlib streams of known decompressed length (RFC 1950 and 1951).
 
-import { assertValid } from "./errors.js";
+import { DamagedData, assertValid } from "./errors.js";
 
 const BLOCK_FIXED = 1;
 const BLOCK_DYNAMIC = 2;
@@ -45,6 +45,12 @@ const buildDeflateCode = (lengths, mayBeSingle) => {
   return { counts, symbols };
 };
 
+/** The codes of literals and of distances in blocks of fixed codes. */
+const FIXED_CODES = [
+  buildDeflateCode(Uint8Array.from({ length: 288 }, (_, i) => (i < 144 ? 8 : i < 256 ? 9 : i < 280 ? 7 : 8)), false),
+  buildDeflateCode(new Uint8Array(32).fill(5), false),
+];
+
 /**
  * Computes the Adler-32 checksum of bytes.
  * @param {Uint8Array} bytes
@@ -75,7 +81,7 @@ export const inflateZlib = (data, length) => {
   /** @param {number} count at most 16 */
   const takeBits = (count) => {
     while (bits < count) {
-      assertValid(offset < data.length, "its deflate stream ends too early");
+      assertValid(offset < data.length, "a deflate stream is cut short");
       pending |= data[offset++] << bits;
       bits += 8;
     }
@@ -95,13 +101,12 @@ export const inflateZlib = (data, length) => {
       first = (first + count) << 1;
       code <<= 1;
     }
-    assertValid(false, "its deflate stream holds a code that means nothing");
-    return 0;
+    throw new DamagedData("a deflate code is not assigned");
   };
 
   /** @param {number} byte */
   const putByte = (byte) => {
-    assertValid(written < length, `it unpacks to more than ${length} bytes`);
+    assertValid(written < length, "it unpacks to too many bytes");
     out[written++] = byte;
   };
 
@@ -109,15 +114,10 @@ export const inflateZlib = (data, length) => {
     pending = bits = 0; // a stored block begins at the next whole byte
     const count = takeBits(16), inverse = takeBits(16);
     assertValid((count ^ inverse) === 0xffff && offset + count <= data.length, "a stored block is damaged");
-    assertValid(written + count <= length, `it unpacks to more than ${length} bytes`);
+    assertValid(written + count <= length, "it unpacks to too many bytes");
     out.set(data.subarray(offset, offset + count), written);
     offset += count;
     written += count;
-  };
-
-  const fixedCodes = () => {
-    const lengths = Uint8Array.from({ length: 288 }, (_, i) => (i < 144 ? 8 : i < 256 ? 9 : i < 280 ? 7 : 8));
-    return [buildDeflateCode(lengths, false), buildDeflateCode(new Uint8Array(32).fill(5), false)];
   };
 
   const readDynamicCodes = () => {
@@ -154,12 +154,12 @@ export const inflateZlib = (data, length) => {
       }
       if (symbol === 256) return;
       const lengthIndex = symbol - 257;
-      assertValid(lengthIndex < 29, "its deflate stream holds a code that means nothing");
+      assertValid(lengthIndex < 29, "a deflate code is not assigned");
       const count = LENGTH_BASES[lengthIndex] + takeBits(LENGTH_EXTRA_BITS[lengthIndex]);
       const distanceIndex = takeSymbol(distanceCode);
-      assertValid(distanceIndex < 30, "its deflate stream holds a code that means nothing");
+      assertValid(distanceIndex < 30, "a deflate code is not assigned");
       const distance = DISTANCE_BASES[distanceIndex] + takeBits(DISTANCE_EXTRA_BITS[distanceIndex]);
-      assertValid(distance <= written, "its deflate stream refers to what was never there");
+      assertValid(distance <= written, "a back-reference points before the start");
       for (let i = 0; i < count; i++) putByte(out[written - distance]);
     }
   };
@@ -167,9 +167,9 @@ export const inflateZlib = (data, length) => {
   for (let last = false; !last; ) {
     last = takeBits(1) === 1;
     const kind = takeBits(2);
-    assertValid(kind <= BLOCK_DYNAMIC, "a deflate block is of an unknown kind");
+    assertValid(kind <= BLOCK_DYNAMIC, "a deflate block has an unknown kind");
     if (kind === 0) copyStored();
-    else inflateBlock(kind === BLOCK_FIXED ? fixedCodes() : readDynamicCodes());
+    else inflateBlock(kind === BLOCK_FIXED ? FIXED_CODES : readDynamicCodes());
   }
   assertValid(written === length && offset + 4 === data.length, `it does not unpack to ${length} bytes`);
   const checksum = new DataView(data.buffer, data.byteOffset).getUint32(offset);

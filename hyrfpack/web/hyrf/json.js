@@ -1,7 +1,7 @@
 // Parses JSON by the rules of docs/reference/format.md 2.1. Unlike JSON.parse, it distinguishes 1 from 1.0 and limits
 // the nesting.
 
-import { assertValid } from "./errors.js";
+import { DamagedData, assertValid } from "./errors.js";
 
 const MAX_NESTING_DEPTH = 64;
 const MAX_INTEGER_DIGITS = 4300;
@@ -36,8 +36,12 @@ export class JsonNumber {
 export const parseJson = (text) => {
   let place = 0;
 
+  const invalidJson = () => new DamagedData(`it is not valid JSON at character ${place}`);
+
   /** @param {boolean} holds */
-  const assertJson = (holds) => assertValid(holds, `it is not valid JSON at character ${place}`);
+  const assertJson = (holds) => {
+    if (!holds) throw invalidJson();
+  };
 
   const skipWhitespace = () => {
     for (; ; place++) {
@@ -69,8 +73,7 @@ export const parseJson = (text) => {
     try {
       return JSON.parse(text.slice(start, place));
     } catch {
-      assertJson(false);
-      return "";
+      throw invalidJson();
     }
   };
 
@@ -78,10 +81,7 @@ export const parseJson = (text) => {
   const parseNumber = () => {
     NUMBER_PATTERN.lastIndex = place;
     const match = NUMBER_PATTERN.exec(text);
-    if (!match) {
-      assertJson(false);
-      return new JsonNumber("0", true);
-    }
+    if (!match) throw invalidJson();
     place = NUMBER_PATTERN.lastIndex;
     const isInteger = match[1] === undefined && match[2] === undefined;
     const number = new JsonNumber(match[0], isInteger);

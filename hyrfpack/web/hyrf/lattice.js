@@ -45,7 +45,7 @@ export const decodeLattice = (data, count) => {
   const base = data[0], classCount = data[1], gapsAt = LATTICE_HEADER_BYTES + classCount;
   const classesAt = gapsAt + view.getUint32(2, true), tailsAt = classesAt + view.getUint32(6, true);
   const areClassesKnown = classCount >= 1 && classCount <= MAX_POINT_CLASSES;
-  assertValid(base >= 1 && base <= MAX_BITS_PER_AXIS && areClassesKnown, "its header cannot be");
+  assertValid(base >= 1 && base <= MAX_BITS_PER_AXIS && areClassesKnown, "its header has invalid values");
   assertValid(tailsAt <= data.length, "it ends too early");
   const bits = data.subarray(LATTICE_HEADER_BYTES, gapsAt);
   assertValid(bits.every((b) => b >= base && b <= MAX_BITS_PER_AXIS), "a class of points has too few or too many bits");

@@ -33,8 +33,9 @@ import { JsonNumber, parseJson } from "./json.js";
 const CODEC_JSON = 0;
 const CODEC_DEFLATED = 5;
 const MAX_METADATA_BYTES = 2 ** 20;
+const MAX_DEFLATE_OVERHEAD_BYTES = 1024; // bounds the time that a forged stream of empty blocks can take
 const MAX_GAUSSIANS = 2 ** 40 - 1;
-const MAX_QUAT_LENGTH_ERROR = 1e-6;
+export const MAX_QUAT_LENGTH_ERROR = 1e-6;
 
 /** @type {Record<string, string | number>} */
 const KNOWN_RULES = {
@@ -71,8 +72,10 @@ export const readMetadata = (container) => {
  */
 const decodeMetadataText = (container, { codec, raw, stored, end }) => {
   if (codec !== CODEC_JSON && codec !== CODEC_DEFLATED) rejectNewer(`its metadata has codec ${codec}`);
-  if (raw > MAX_METADATA_BYTES) rejectDamaged(`its metadata has ${raw} bytes, and ${MAX_METADATA_BYTES} may be`);
-  if (codec === CODEC_JSON && raw !== stored) rejectDamaged(`its metadata has ${stored} bytes and says ${raw}`);
+  if (raw > MAX_METADATA_BYTES) rejectDamaged(`its metadata has more than ${MAX_METADATA_BYTES} bytes`);
+  if (codec === CODEC_JSON ? raw !== stored : stored > raw + MAX_DEFLATE_OVERHEAD_BYTES) {
+    rejectDamaged(`its metadata has ${stored} bytes and says ${raw}`);
+  }
   if (!container.has("META")) rejectIncomplete(container, end);
   const bytes = container.stored("META");
   // TextDecoder does not accept shared memory, so the bytes are copied.

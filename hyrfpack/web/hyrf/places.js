@@ -41,14 +41,16 @@ export function viewFromPlace(view, { rows, scale, shift }) {
 }
 
 /**
- * Moves positions (3 N) of a part to the scene's units.
+ * Returns positions (3 N) of a part in the scene's units: the same array if the part is the scene.
  * @param {Float32Array} positions
  * @param {Place} place
  */
-export function movePositions(positions, { rows, scale, shift }) {
-  const moved = new Float32Array(positions.length);
+export function movePositions(positions, place) {
+  if (place === IDENTITY_PLACE) return positions;
+  const { rows, scale, shift } = place, moved = new Float32Array(positions.length);
   for (let p = 0; p < positions.length; p += 3) {
-    moved.set(add(mul(rotateBy(rows, [positions[p], positions[p + 1], positions[p + 2]]), scale), shift), p);
+    const x = positions[p], y = positions[p + 1], z = positions[p + 2];
+    for (let k = 0; k < 3; k++) moved[p + k] = (rows[k][0] * x + rows[k][1] * y + rows[k][2] * z) * scale + shift[k];
   }
   return moved;
 }

@@ -63,7 +63,7 @@ export const decodeVectors = (data, rows, columns) => {
   const stages = data[0], words = data[2] | (data[3] << 8);
   const codebooksEnd = VECTORS_HEADER_BYTES + 2 * stages * words * columns;
   const isKnown = stages >= 1 && stages <= MAX_STAGES && data[1] === columns && words >= 1;
-  assertValid(isKnown && codebooksEnd <= data.length, "the sizes of its codebooks cannot be");
+  assertValid(isKnown && codebooksEnd <= data.length, "the sizes of its codebooks are invalid");
   const codebooks = decodeFloat16(data.subarray(VECTORS_HEADER_BYTES, codebooksEnd), stages * words * columns);
   assertValid(codebooks.every(Number.isFinite), "its codebooks hold numbers that are not finite");
   const view = new DataView(data.buffer, data.byteOffset, data.length);
@@ -95,11 +95,11 @@ export const decodeMinMax = (data, count) => {
   const view = new DataView(data.buffer, data.byteOffset, data.length);
   const minimum = view.getFloat32(0, true), maximum = view.getFloat32(4, true), bits = data[8];
   const isRange = minimum > -Infinity && minimum <= maximum && maximum < Infinity;
-  assertValid(isRange && bits >= 1 && bits <= 16, "its range cannot be");
+  assertValid(isRange && bits >= 1 && bits <= 16, "its range is invalid");
   const codes = decodeHuffman(data.subarray(MIN_MAX_HEADER_BYTES), count), last = 2 ** bits - 1;
   const numbers = new Float32Array(count);
   for (let i = 0; i < count; i++) {
-    assertValid(codes[i] <= last, `a code has more than ${bits} bits`);
+    assertValid(codes[i] <= last, "a code has too many bits");
     numbers[i] = ((last - codes[i]) * minimum + codes[i] * maximum) / last;
   }
   return numbers;

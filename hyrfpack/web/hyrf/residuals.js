@@ -81,9 +81,8 @@ export const decodeResiduals = (data, { classes, count }, columns, isColor) => {
   }
   for (const row of rows) {
     for (let at = row * columns; at < (row + 1) * columns; at += 3) {
-      for (let color = 0; color < 3; color++) {
-        const [a, b, c] = basis.slice(3 * color, 3 * color + 3);
-        numbers[at + color] = values[at] * a + values[at + 1] * b + values[at + 2] * c;
+      for (let k = 0; k < 9; k += 3) {
+        numbers[at + k / 3] = values[at] * basis[k] + values[at + 1] * basis[k + 1] + values[at + 2] * basis[k + 2];
       }
     }
   }

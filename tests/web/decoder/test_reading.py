@@ -23,6 +23,7 @@ from forged_files import (
     assemble_file,
     build_file,
     channel_payload,
+    file_with_empty_deflate_blocks,
     file_with_largest_tables,
     file_with_most_gaussians,
     make_meta,
@@ -588,6 +589,23 @@ def test_small_hostile_files_are_read_or_refused_soon():
         assert bool(verdict.refused) == bool(python.refused), name
         # Half a second of CPU time is enough on most machines. Python's time shows how slow this one is.
         assert verdict.seconds < max(0.5, 3 * python.seconds) and not verdict.failed, name
+
+
+def test_many_empty_deflate_blocks_are_read_soon():
+    """There are some 160,000 of them, for each of which a slow reader builds its tables again."""
+    data = file_with_empty_deflate_blocks(text_bytes=200_000, added_bytes=0)
+
+    (verdict,) = read_in_javascript([(data, False)])
+
+    python = read_in_python(data)
+    assert verdict.groups and not python.refused
+    assert verdict.seconds < max(0.5, 3 * python.seconds)
+
+
+def test_deflated_metadata_is_at_most_1024_bytes_longer_than_its_text():
+    files = {str(added): file_with_empty_deflate_blocks(1000, added) for added in (1024, 1025)}
+
+    assert check_readers_agree(files) == (["1024"], ["1025"])
 
 
 @pytest.mark.parametrize("make", [file_with_most_gaussians, file_with_largest_tables], ids=lambda make: make.__name__)

@@ -69,7 +69,7 @@ export type Model = import("./index.js").Model;
  *   model is empty: then all Gaussians are present, with their colours from the first viewpoint. An exception that
  *   `report` throws ends the conversion.
  * @returns {Promise<Splats>}
- * @throws {HyrfFormatError} a resulting number is NaN or infinite
+ * @throws {HyrfFormatError} a shape or a colour is NaN or infinite
  */
 export declare function fitHarmonics(model: Model, viewpoints: import("./viewpoint.js").Camera[], degree: number, report?: (progress: {
     done: number;

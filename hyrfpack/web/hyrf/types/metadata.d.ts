@@ -33,6 +33,7 @@ export type Metadata = {
     provenance: Record<string, any>;
     writer: string;
 };
+export declare const MAX_QUAT_LENGTH_ERROR = 0.000001;
 /**
  * Reads and checks the metadata of a file.
  * @param {Container} container

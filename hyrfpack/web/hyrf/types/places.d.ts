@@ -28,8 +28,8 @@ export declare function placeOf(own: import("./metadata.js").Frame, scene: impor
  */
 export declare function viewFromPlace<SceneView extends View>(view: SceneView, { rows, scale, shift }: Place): SceneView;
 /**
- * Moves positions (3 N) of a part to the scene's units.
+ * Returns positions (3 N) of a part in the scene's units: the same array if the part is the scene.
  * @param {Float32Array} positions
  * @param {Place} place
  */
-export declare function movePositions(positions: Float32Array, { rows, scale, shift }: Place): Float32Array<ArrayBuffer>;
+export declare function movePositions(positions: Float32Array, place: Place): Float32Array<ArrayBufferLike>;

@@ -33,7 +33,8 @@ export type SkySize = {
  * A row of Gaussians, of which the first has the index GAUSSIANS_PER_ROW times `row`. `shapes` has FLOATS_PER_SHAPE
  * numbers for each: its position, and its three axes, each with the length of the standard deviation, in local units.
  * `pixelSizes` has the pixel size of the photos at each, in local units, or 0 (see sampling.js). Both are null if they
- * were delivered before. `colors` has red, green, blue and opacity of each, in [0, 1].
+ * were delivered before. `colors` has red, green, blue and opacity of each, in [0, 1]; colours with residuals may
+ * exceed 1.
  * @typedef {{row: number, shapes: Float32Array | null, pixelSizes: Float32Array | null, colors: Float32Array}}
  *   EvaluatedRow
  *
