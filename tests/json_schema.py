@@ -22,7 +22,7 @@ def matches(value: Any, schema: dict[str, Any], root: dict[str, Any] | None = No
             "array": isinstance(value, list),
             "string": isinstance(value, str),
             "boolean": isinstance(value, bool),
-            "integer": type(value) is int,
+            "integer": type(value) is int or (type(value) is float and value.is_integer()),
             "number": type(value) in (int, float),
         }[name],
         "required": lambda names: all(name in value for name in names),

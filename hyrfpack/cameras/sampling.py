@@ -49,13 +49,15 @@ class PhotoCameras:
 
     @classmethod
     def from_provenance(cls, provenance: dict) -> PhotoCameras:
-        """Read an untrusted provenance. A list of cameras with one that is not valid counts as missing.
+        """Read an untrusted provenance.
 
-        Of a list with more than MAX_SAMPLING_CAMERAS, the first ones count.
+        Of a list of more than MAX_SAMPLING_CAMERAS, the first ones count. If one of these is not valid, the list counts
+        as missing.
         """
         stored = provenance.get(BACKGROUND_STRIDE_KEY)
-        is_valid = isinstance(stored, int) and not isinstance(stored, bool) and 1 <= stored <= MAX_BACKGROUND_STRIDE
-        stride = cast(int, stored) if is_valid else DEFAULT_BACKGROUND_STRIDE
+        is_number = isinstance(stored, (int, float)) and not isinstance(stored, bool)
+        is_valid = is_number and stored in range(1, MAX_BACKGROUND_STRIDE + 1)  # 3.0 is an integer of JSON, too
+        stride = int(cast(float, stored)) if is_valid else DEFAULT_BACKGROUND_STRIDE
         for key in ("cameras", "coarse_cameras"):
             with suppress(TypeError, ValueError, ArithmeticError):
                 kept = list(provenance.get(key) or ())[:MAX_SAMPLING_CAMERAS]

@@ -31,6 +31,7 @@ MAX_MANIFEST_BYTES = 1 << 24
 MAX_CHUNKS = 1 << 16
 MAX_ERROR_RADII = 16
 _MAX_INTEGER = (1 << 40) - 1
+_MAX_QUAT_LENGTH_ERROR = 1e-6  # that of `rotations.MAX_LENGTH_ERROR`, which needs numpy
 _CHECKSUM_PATTERN = re.compile(r"[0-9a-f]{8}")
 _VERSION_PATTERN = re.compile(r"(\d{1,4})\.(\d{1,4})")
 
@@ -218,7 +219,7 @@ def _parse_values(values: Mapping[str, Any], major: int) -> Manifest:
         parts=parts,
         chunks=chunks,
         error_radii=radii,
-        frame=dict(_object(values, "frame")),
+        frame=_frame(values),
         background=_typed(values, "background", bool),
         solid=_triple(values, "solid"),
         viewpoint=dict(_object(values, "viewpoint")),
@@ -291,6 +292,20 @@ def _list(values: Mapping[str, Any], key: str, lengths: range) -> list[Any]:
     return items
 
 
+def _frame(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Check what places a view; the files have the whole frame."""
+    frame = _object(values, "frame")
+    _triple(frame, "center")
+    (scale,) = _numbers({"scale": [frame.get("scale")]}, "scale", range(1, 2))
+    if scale <= 0:
+        raise ValueError("'scale' must be positive")
+    if "rotation" in frame:
+        length = math.hypot(*_numbers(frame, "rotation", range(4, 5)))
+        if abs(length - 1) > _MAX_QUAT_LENGTH_ERROR:
+            raise ValueError("'rotation' has not unit length")
+    return dict(frame)
+
+
 def _text(values: Mapping[str, Any], key: str) -> str:
     text = _typed(values, key, str)
     check_text(f"'{key}'", text, MAX_TITLE_LENGTH)
@@ -298,7 +313,11 @@ def _text(values: Mapping[str, Any], key: str) -> str:
 
 
 def _integer(values: Mapping[str, Any], key: str, maximum: int = _MAX_INTEGER) -> int:
-    value = _typed(values, key, int)
+    value = values.get(key)
+    if isinstance(value, float) and value.is_integer():  # such as 3.0, which JSON Schema and JavaScript accept
+        value = int(value)
+    else:
+        value = _typed(values, key, int)
     if not 0 <= value <= maximum:
         raise ValueError(f"'{key}' is out of range")
     return value

@@ -3,7 +3,9 @@
 
 import { MAX_PARTS } from "./container.js";
 import { DamagedData, HyrfFormatError, assertValid, groupedDigits, quotedText } from "./errors.js";
+import { MAX_QUAT_LENGTH_ERROR } from "./metadata.js";
 import { arePartNames } from "./parts.js";
+import { IDENTITY_QUAT } from "./rotation.js";
 import { isFileName } from "./shared.js";
 
 /**
@@ -111,6 +113,7 @@ const checkManifest = (values, leastParts) => {
   checkList(chunks, "chunks", 0, MAX_CHUNKS);
   for (const chunk of chunks) checkChunk(chunk, radii.length, parts.length);
   for (const key of ["frame", "viewpoint"]) assertValid(isObject(values[key]), `'${key}' must be an object`);
+  checkFrame(values.frame);
   assertValid(typeof values.background === "boolean", "'background' must be true or false");
   checkNumbers(values.solid, "solid", 3, 3);
   checkList(values.cameras, "cameras", 0, MAX_CAMERAS);
@@ -127,6 +130,18 @@ const checkManifest = (values, leastParts) => {
   // Some file systems ignore case.
   const names = listFiles(/** @type {Manifest} */ (values)).map(({ file }) => file.toLowerCase());
   assertValid(new Set(names).size === names.length, "two files have the same name");
+};
+
+/**
+ * Checks what places a view; the files have the whole frame.
+ * @param {any} frame
+ */
+const checkFrame = ({ center, scale, rotation = IDENTITY_QUAT }) => {
+  checkNumbers(center, "center", 3, 3);
+  checkNumbers([scale], "scale", 1, 1);
+  checkNumbers(rotation, "rotation", 4, 4);
+  const isValid = scale > 0 && Math.abs(Math.hypot(...rotation) - 1) <= MAX_QUAT_LENGTH_ERROR;
+  assertValid(isValid, "'frame' has an invalid scale or rotation");
 };
 
 /**
@@ -168,7 +183,10 @@ const checkChunk = (chunk, radii, parts) => {
  */
 const checkFile = (file, key) => {
   assertValid(isObject(file), `'${key}' must be an object`);
-  assertValid(isFileName(file.file), `${quotedText(String(file.file))} is not the name of a .hyrf file in the folder`);
+  if (!isFileName(file.file)) {
+    const name = typeof file.file === "string" ? quotedText(file.file) : `'file' of '${key}'`;
+    throw new DamagedData(`${name} is not the name of a .hyrf file in the folder`);
+  }
   checkInteger(file.bytes, "bytes");
   const isChecksum = typeof file.crc32 === "string" && /^[0-9a-f]{8}$/.test(file.crc32);
   assertValid(isChecksum, `the checksum of ${file.file} is not 8 hexadecimal digits`);
@@ -191,8 +209,8 @@ const checkInteger = (value, key) =>
  * @param {number} most
  */
 const checkList = (list, key, least, most) => {
-  const isList = Array.isArray(list) && list.length >= least && list.length <= most;
-  assertValid(isList, `'${key}' must be a list of ${least} to ${groupedDigits(most)} entries`);
+  if (Array.isArray(list) && list.length >= least && list.length <= most) return;
+  throw new DamagedData(`'${key}' must be a list of ${least} to ${groupedDigits(most)} entries`);
 };
 
 /**

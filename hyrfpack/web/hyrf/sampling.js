@@ -52,9 +52,9 @@ export function pixelSizes(positions, metadata) {
  * @param {Metadata} metadata
  */
 function samplingCameras(metadata) {
-  const { cameras, isCoarse } = storedCameras(metadata), stored = metadata.provenance?.rate_ratio;
+  const { cameras, isCoarse } = storedCameras(metadata, MAX_CAMERAS), stored = metadata.provenance?.rate_ratio;
   const isValid = Number.isFinite(stored) && stored >= 1 && stored <= MAX_RATE_RATIO;
-  return { cameras: cameras.slice(0, MAX_CAMERAS), ratio: isValid ? stored : isCoarse ? COARSE_RATE_RATIO : 1 };
+  return { cameras, ratio: isValid ? stored : isCoarse ? COARSE_RATE_RATIO : 1 };
 }
 
 /**

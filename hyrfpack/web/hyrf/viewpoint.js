@@ -97,22 +97,24 @@ export function toLocalView(camera, frame) {
 /**
  * Returns the cameras that a file keeps: the training cameras or, if these are absent or invalid, the few coarse ones.
  * @param {import("./metadata.js").Metadata} metadata the checked metadata of the model
+ * @param {number} [limit] only so many cameras at the start of a list count; the others may be invalid
  * @returns {{cameras: Camera[], isCoarse: boolean}} `cameras` is empty if the file keeps none that are valid
  */
-export function storedCameras({ provenance }) {
-  const [exact, coarse] = [provenance?.cameras, provenance?.coarse_cameras].map(parseStoredCameras);
+export function storedCameras({ provenance }, limit = Infinity) {
+  const [exact, coarse] = [provenance?.cameras, provenance?.coarse_cameras].map((list) => parseCameras(list, limit));
   return exact.length ? { cameras: exact, isCoarse: false } : { cameras: coarse, isCoarse: true };
 }
 
 /**
  * Parses the cameras of a provenance. Returns an empty list if one of them is invalid.
  * @param {any} stored a parsed JSON value
+ * @param {number} limit
  * @returns {Camera[]}
  */
-function parseStoredCameras(stored) {
+function parseCameras(stored, limit) {
   if (!Array.isArray(stored)) return [];
-  const cameras = stored.map(parseCameraNumbers).filter((camera) => camera !== null);
-  return cameras.length === stored.length ? cameras : [];
+  const cameras = stored.slice(0, limit).map(parseCameraNumbers);
+  return cameras.every((camera) => camera !== null) ? cameras : [];
 }
 
 /**

@@ -17,13 +17,19 @@ from scenes import camera_at
 from web.scripts import run_script
 
 from hyrfpack.cameras.files import camera_to_json
+from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, ScenePart, parse_manifest
 from hyrfpack.lod.select import predict_errors, select_levels
 from tools.safety.make_golden import GOLDEN_PARTS_SCENE_FOLDER, GOLDEN_SCENE_FOLDER
 
 SELECT_SCRIPT = Path(__file__).with_name("select_levels.mjs")
 LATER_VERSION = json.dumps({**json.loads(VALID_MANIFEST.to_json()), "version": "1.7", "sky": "blue"}).encode()
+FRAME = {"center": [0, 0, 0], "scale": 1, "half_extent": [1, 1, 1]}
+ROTATED = with_value(["frame", "rotation"], [0.6, 0, -0.8, 0])
+INTEGRAL_FLOATS = VALID_MANIFEST.to_json().replace(b'"bytes":1000,', b'"bytes":1000.0,')
+NESTED_NAME = VALID_MANIFEST.to_json().replace(b'"shared.hyrf"', b"[" * 20_000 + b"]" * 20_000)
 BAD_MANIFESTS = [
+    NESTED_NAME,
     b"",
     b"[]",
     b"{}",
@@ -45,6 +51,9 @@ BAD_MANIFESTS = [
             (["shared", "bytes"], 2**40),
             (["shared", "crc32"], "XYZ"),
             (["shared", "file"], "../shared.hyrf"),
+            (["shared", "file"], {"toString": 1, "valueOf": 1}),
+            (["shared", "file"], None),
+            (["shared", "file"], 5),
             (["chunks", 0, "levels", 0, "file"], "a/b.hyrf"),
             (["chunks", 1, "levels", 0, "file"], "Shared.hyrf"),
             (["chunks", 0, "levels"], []),
@@ -58,6 +67,15 @@ BAD_MANIFESTS = [
             (["solid"], None),
             (["background"], 1),
             (["frame"], []),
+            (["frame"], {}),
+            (["frame", "center"], [0, 0]),
+            (["frame", "center"], [0, 0, "0"]),
+            (["frame", "scale"], 0),
+            (["frame", "scale"], None),
+            (["frame", "rotation"], "x"),
+            (["frame", "rotation"], None),
+            (["frame", "rotation"], [1, 0, 0]),
+            (["frame", "rotation"], [1, 0, 0, 1]),
             (["cameras"], [[]]),
             (["title"], "two\nlines"),
             (["licence"], "x" * 1001),
@@ -107,7 +125,7 @@ def random_manifest(rng: np.random.Generator) -> Manifest:
         chunks.append(Chunk(tuple(low), tuple(low + rng.uniform(0, 10, 3)), tuple(levels)))
     count = sum(chunk.levels[0].gaussians for chunk in chunks)
     return Manifest(
-        count, (ScenePart("shared.hyrf", 500, "0123abcd"),), tuple(chunks), radii, {}, False, (0.0, 0.0, 0.0)
+        count, (ScenePart("shared.hyrf", 500, "0123abcd"),), tuple(chunks), radii, FRAME, False, (0.0, 0.0, 0.0)
     )
 
 
@@ -158,7 +176,7 @@ def test_levels_that_are_not_available_are_left_out(tmp_path: Path):
         for chunk in chunks
     )
     count = sum(chunk.levels[0].gaussians for chunk in chunks)
-    manifest = Manifest(count, files, chunks, (50.0,), {}, False, (0.0, 0.0, 0.0))
+    manifest = Manifest(count, files, chunks, (50.0,), FRAME, False, (0.0, 0.0, 0.0))
     missing = [[0, 0], *([1, level] for level in range(len(chunks[1].levels)))]
     limit = count // 3
 
@@ -190,7 +208,7 @@ def test_levels_that_are_not_available_are_left_out(tmp_path: Path):
 def test_manifests_are_accepted_and_refused_as_in_python(tmp_path: Path):
     folders = (GOLDEN_SCENE_FOLDER, GOLDEN_PARTS_SCENE_FOLDER)
     golden = [(folder / "scene.json").read_bytes() for folder in folders]
-    good = [VALID_MANIFEST.to_json(), PARTS_MANIFEST.to_json(), LATER_VERSION, *golden]
+    good = [VALID_MANIFEST.to_json(), PARTS_MANIFEST.to_json(), LATER_VERSION, INTEGRAL_FLOATS, ROTATED, *golden]
 
     answers = run(tmp_path, [{"manifest": data} for data in good + BAD_MANIFESTS])
 
@@ -198,5 +216,9 @@ def test_manifests_are_accepted_and_refused_as_in_python(tmp_path: Path):
         expected = json.loads(json.dumps(asdict(manifest)))
         assert {key: answer[key] for key in expected} == expected
     assert all("refused" not in answer for answer in answers[: len(good)])
+    for data in good:
+        parse_manifest(data)
     for data, answer in zip(BAD_MANIFESTS, answers[len(good) :], strict=True):
+        with pytest.raises(HyrfFormatError):
+            parse_manifest(data)
         assert answer.get("refused", "").count("\n") == 0 and "refused" in answer, data

@@ -126,6 +126,17 @@ def test_forged_cameras_limit_nothing_and_take_no_long_time(tmp_path: Path) -> N
     np.testing.assert_allclose(sizes, [[4 / FOCAL_PIXELS], [0]], rtol=FLOAT32_ROUNDING)
 
 
+def test_an_invalid_camera_after_the_first_128_does_not_matter(tmp_path: Path) -> None:
+    """In both readers, the same camera among the first 128 makes the list count as missing."""
+    row = camera_to_numbers(axis_camera())
+    late, early = ({"cameras": [row] * count + [[1, 2, 3], row]} for count in (128, 127))
+
+    sizes = [sample_in_node(tmp_path, provenance)["sizes"] for provenance in (late, early)]
+
+    np.testing.assert_allclose(sizes, [[4 / FOCAL_PIXELS], [0]], rtol=FLOAT32_ROUNDING)
+    assert [len(PhotoCameras.from_provenance(each).cameras) for each in (late, early)] == [128, 0]
+
+
 @pytest.mark.parametrize("provenance", [None, {}, {"cameras": 3}, {"cameras": []}, {"coarse_cameras": [[1]]}])
 def test_without_cameras_nothing_is_filtered_and_each_pixel_has_its_background(tmp_path: Path, provenance: Any) -> None:
     found = sample_in_node(tmp_path, provenance, focals=(1.0, 1e4))
@@ -139,6 +150,7 @@ def test_without_cameras_nothing_is_filtered_and_each_pixel_has_its_background(t
         ({}, [1, 1, 2, 2, 3, 6, 64]),
         ({"background_stride": 1}, [1, 1, 1, 1, 1, 3, 64]),
         ({"background_stride": 4}, [1, 2, 3, 4, 6, 12, 64]),
+        ({"background_stride": 4.0}, [1, 2, 3, 4, 6, 12, 64]),
         ({"background_stride": 64}, [16, 32, 63, 64, 64, 64, 64]),
         *(({"background_stride": wrong}, [1, 1, 2, 2, 3, 6, 64]) for wrong in (65, 1.5, "4")),
         *(
@@ -154,6 +166,8 @@ def test_strides_keep_the_spacing_of_training(tmp_path: Path, stored: dict, stri
     found = sample_in_node(tmp_path, provenance_of(cameras, **stored), focals=focals)
 
     assert found["strides"] == strides
+    photos = PhotoCameras.from_provenance(provenance_of(cameras, **stored))
+    assert found["spacing"] == pytest.approx(photos.background_spacing, rel=1e-12)
 
 
 @pytest.mark.parametrize("rotation", [(1.0, 0.0, 0.0, 0.0), (0.5, -0.1, 0.7, 0.5)], ids=["straight", "rotated"])

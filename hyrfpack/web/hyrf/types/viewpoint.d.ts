@@ -63,9 +63,10 @@ export declare function toLocalView(camera: Camera, frame: import("./metadata.js
 /**
  * Returns the cameras that a file keeps: the training cameras or, if these are absent or invalid, the few coarse ones.
  * @param {import("./metadata.js").Metadata} metadata the checked metadata of the model
+ * @param {number} [limit] only so many cameras at the start of a list count; the others may be invalid
  * @returns {{cameras: Camera[], isCoarse: boolean}} `cameras` is empty if the file keeps none that are valid
  */
-export declare function storedCameras({ provenance }: import("./metadata.js").Metadata): {
+export declare function storedCameras({ provenance }: import("./metadata.js").Metadata, limit?: number): {
     cameras: Camera[];
     isCoarse: boolean;
 };
