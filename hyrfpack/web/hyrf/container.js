@@ -81,6 +81,8 @@ export class Container {
     this.entries = new Map();
     /** The file that holds the sections of codec 12, once it is known. @type {Container | null} */
     this.shared = null;
+    /** The name of this file, if another one refers to it. */
+    this.name = "";
     /** Results of decoding that files which refer to this one need, too. @type {Map<string, any>} */
     this.decoded = new Map();
     this.checkEntries(this.checkHeader(partial));

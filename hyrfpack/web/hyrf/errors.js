@@ -48,6 +48,18 @@ export const assertValid = (holds, what) => {
   if (!holds) throw new DamagedData(what);
 };
 
+// What browsers say of arrays that are too long, or for which there is no memory.
+const MEMORY_MESSAGE = /alloc|length|memory|array size/i;
+
+/**
+ * Returns an error, or one with a clear message in place of that for an array that is too long for the memory.
+ * @param {any} error
+ */
+export const explainMemory = (error) =>
+  error instanceof RangeError && MEMORY_MESSAGE.test(error.message)
+    ? new HyrfFormatError("The model takes more memory than there is; open a smaller one.")
+    : error;
+
 /**
  * Quotes text from a file for a message: at most 40 characters, on one line, in ASCII.
  * @param {string} text

@@ -3,7 +3,7 @@
 import { decodeChannels } from "./channels.js";
 import { Container, EXPOSURE_TYPE, FIELD_TYPES, LAYERED_TYPES } from "./container.js";
 import { PART_NAMES_TYPE, RESIDUAL_TYPES, layerType, rejectIncomplete } from "./container.js";
-import { DamagedData, HyrfError, HyrfFormatError, rejectDamaged, rejectNewer } from "./errors.js";
+import { DamagedData, HyrfError, HyrfFormatError, explainMemory, rejectDamaged, rejectNewer } from "./errors.js";
 import { decodeExposure } from "./exposure.js";
 import { FEATURES_PER_ROW, decoderSize, tableRows } from "./grids.js";
 import { decodeGroups, decoderGroups, readTableGroups, tableGroups } from "./groups.js";
@@ -12,7 +12,7 @@ import { readMetadata } from "./metadata.js";
 import { openParts, readPartNames } from "./parts.js";
 import { decodeFloat16, decodeFloat32, decodeMinMax, decodeVectors } from "./plain.js";
 import { decodeResiduals, residualColumns } from "./residuals.js";
-import { CODEC_SHARED, attachShared, sharedFileName } from "./shared.js";
+import { CODEC_SHARED, attachShared, explainShared, sharedFileName } from "./shared.js";
 
 export { HyrfError, HyrfFormatError };
 
@@ -107,10 +107,8 @@ export const describe = (bytes) => {
 export const read = async (bytes, { partial = false, openFile } = {}) => {
   const container = new Container(bytes, partial), name = sharedFileName(container);
   if (name !== null && openFile) attachShared(container, name, await openFile(name));
-  return explainMemory(() => {
-    if (!container.entries.has(PART_NAMES_TYPE)) return readModel(container);
-    throw new HyrfFormatError(`The file holds ${readPartNames(container).length} merged models; use readParts.`);
-  });
+  if (!container.entries.has(PART_NAMES_TYPE)) return readModel(container);
+  throw new HyrfFormatError(`The file holds ${readPartNames(container).length} merged models; use readParts.`);
 };
 
 /**
@@ -120,32 +118,16 @@ export const read = async (bytes, { partial = false, openFile } = {}) => {
  * @returns {Promise<{name: string, model: Model}[]>}
  * @throws {HyrfFormatError} the file is damaged, truncated or too new
  */
-export const readParts = async (bytes) =>
-  explainMemory(() => {
-    const container = new Container(bytes, false);
-    if (!container.entries.has(PART_NAMES_TYPE)) return [{ name: "scene", model: readModel(container) }];
-    const parts = openParts(container);
-    const metadatas = parts.map((part) => readMetadata(part.container));
-    checkGaussians(metadatas.reduce((sum, { gaussians }) => sum + gaussians, 0), bytes.length);
-    if (metadatas.some(({ config }) => config.antialiased !== metadatas[0].config.antialiased)) {
-      rejectDamaged("some of its parts are antialiased and others are not");
-    }
-    return parts.map((part) => ({ name: part.name, model: readModel(part.container) }));
-  });
-
-/**
- * Returns the result of `decode`. An array that is too long for the memory becomes an error with a clear message.
- * @template Decoded
- * @param {() => Decoded} decode
- * @returns {Decoded}
- */
-const explainMemory = (decode) => {
-  try {
-    return decode();
-  } catch (error) {
-    if (!(error instanceof RangeError)) throw error;
-    throw new HyrfFormatError("The model takes more memory than there is; open a smaller one.");
+export const readParts = async (bytes) => {
+  const container = new Container(bytes, false);
+  if (!container.entries.has(PART_NAMES_TYPE)) return [{ name: "scene", model: readModel(container) }];
+  const parts = openParts(container);
+  const metadatas = parts.map((part) => readMetadata(part.container));
+  checkGaussians(metadatas.reduce((sum, { gaussians }) => sum + gaussians, 0), bytes.length);
+  if (metadatas.some(({ config }) => config.antialiased !== metadatas[0].config.antialiased)) {
+    rejectDamaged("some of its parts are antialiased and others are not");
   }
+  return parts.map((part) => ({ name: part.name, model: readModel(part.container) }));
 };
 
 /**
@@ -165,10 +147,23 @@ const checkGaussians = (count, length) => {
  * @returns {Model}
  */
 const readModel = (container) => {
+  try {
+    return decodeModel(container);
+  } catch (error) {
+    throw explainMemory(error);
+  }
+};
+
+/**
+ * See `readModel`.
+ * @param {Container} container
+ * @returns {Model}
+ */
+const decodeModel = (container) => {
   const metadata = readMetadata(container);
   const { config } = metadata, { shared } = container;
   if (shared) {
-    const { provenance } = decodeOnce(shared, "META", () => readMetadata(shared));
+    const { provenance } = decodeOnce(shared, "META", () => explainShared(shared, () => readMetadata(shared)));
     metadata.provenance = { ...provenance, ...metadata.provenance };
   }
   const counts = metadata.layers?.length ? metadata.layers : [metadata.gaussians];
@@ -224,7 +219,7 @@ const readExposure = (container) => {
   if (!container.has(EXPOSURE_TYPE)) return null;
   const source = sourceOf(container, EXPOSURE_TYPE), { codec, raw } = requireEntry(source, EXPOSURE_TYPE);
   if (codec !== CODEC_EXPOSURE) rejectNewer(`section '${EXPOSURE_TYPE}' has the codec ${codec}, which is unknown`);
-  return nameDamagedSection(EXPOSURE_TYPE, () => decodeExposure(source.stored(EXPOSURE_TYPE), raw));
+  return decodeStored(source, EXPOSURE_TYPE, (data) => decodeExposure(data, raw));
 };
 
 /**
@@ -239,7 +234,9 @@ const sourceOf = (container, type) => {
   if (!container.has(type)) rejectIncomplete(container, requireEntry(container, type).end);
   if (container.shared) return container.shared;
   const name = sharedFileName(container);
-  throw new HyrfFormatError(`The file needs the file ${name} of its folder; open the scene.json of that folder.`);
+  throw new HyrfFormatError(
+    `The file needs the file ${name} of its folder; open the scene.json of that folder, or call read with openFile.`,
+  );
 };
 
 /**
@@ -306,9 +303,11 @@ const requireEntry = (container, type) =>
  * @param {ExpectedSection} section
  */
 const checkSection = (container, { type, rows, columns }) => {
-  const { codec, raw } = requireEntry(sourceOf(container, type), type);
-  if (!PARAMETER_CODECS.includes(codec)) rejectNewer(`section '${type}' has the codec ${codec}, which is unknown`);
-  if (raw !== 4 * rows * columns) rejectDamaged(`section '${type}' says another size than the metadata`);
+  const source = sourceOf(container, type), { codec, raw } = requireEntry(source, type);
+  explainShared(source, () => {
+    if (!PARAMETER_CODECS.includes(codec)) rejectNewer(`section '${type}' has the codec ${codec}, which is unknown`);
+    if (raw !== 4 * rows * columns) rejectDamaged(`section '${type}' says another size than the metadata`);
+  });
 };
 
 /**
@@ -321,16 +320,14 @@ const checkSection = (container, { type, rows, columns }) => {
  */
 const decodeSection = (container, section, config, points) => {
   const { type } = section, source = sourceOf(container, type), { codec } = requireEntry(source, type);
-  const decode = () => {
-    const data = source.stored(type);
-    return nameDamagedSection(type, () => {
+  const decode = () =>
+    decodeStored(source, type, (data) => {
       const numbers = decodeNumbers(section, codec, data, config, points);
       for (let i = 0; i < numbers.length; i++) {
         if (numbers[i] - numbers[i] !== 0) throw new DamagedData("it holds numbers that are not finite");
       }
       return numbers;
     });
-  };
   // Where groups follow from positions, they are those of this file.
   if (source === container || (codec === CODEC_GROUPS && section.columns > 1)) return decode();
   const { geometry, radiance, hidden, direction_encoding } = config; // they determine the section's shape
@@ -338,21 +335,23 @@ const decodeSection = (container, section, config, points) => {
 };
 
 /**
- * Returns the result of `decode`. If it throws DamagedData, the error is replaced by one that names the section.
+ * Returns what `decode` makes of the stored bytes of a section. Errors name the section.
  * @template Decoded
+ * @param {Container} source
  * @param {string} type
- * @param {() => Decoded} decode
+ * @param {(data: Uint8Array) => Decoded} decode
  * @returns {Decoded}
  * @throws {HyrfFormatError}
  */
-const nameDamagedSection = (type, decode) => {
-  try {
-    return decode();
-  } catch (error) {
-    if (!(error instanceof DamagedData)) throw error;
-    throw new HyrfFormatError(`Section '${type}' is damaged: ${error.message}; fetch or write the file again.`);
-  }
-};
+const decodeStored = (source, type, decode) =>
+  explainShared(source, () => {
+    try {
+      return decode(source.stored(type));
+    } catch (error) {
+      if (!(error instanceof DamagedData)) throw error;
+      throw new HyrfFormatError(`Section '${type}' is damaged: ${error.message}; fetch or write the file again.`);
+    }
+  });
 
 /**
  * Decodes the numbers of a section by its codec.

@@ -29,8 +29,10 @@ const MIN_DEPTH_RATIO = 1e-3; // of the distance; nearer centres would project b
  *   `gaussians`: the most Gaussians, or `bytes`: the most bytes of files, with the shared files. Levels that are not
  *   available are not chosen.
  * @returns {LevelSelection}
+ * @throws {TypeError} both limits are given
  */
 export const selectLevels = (manifest, camera, { gaussians, bytes, isAvailable = () => true } = {}) => {
+  if (gaussians !== undefined && bytes !== undefined) throw new TypeError("Give `gaussians` or `bytes`, not both.");
   const { chunks } = manifest, shared = sharedBytes(manifest), errors = predictErrors(manifest, camera);
   const cost = bytes === undefined ? "gaussians" : "bytes";
   const costs = chunks.map(({ levels }) => [...levels.map((level) => level[cost]), 0]);

@@ -2,6 +2,7 @@
 
 import { Container, MAX_PARTS, PART_NAMES_TYPE, partType, rawBytesLimit } from "./container.js";
 import { HyrfFormatError, rejectDamaged, rejectNewer } from "./errors.js";
+import { CODEC_SHARED } from "./shared.js";
 
 const CODEC_NAMES = 0;
 const CODEC_FILE = 10;
@@ -50,7 +51,8 @@ const isName = (name) =>
  * Returns name and container of each part, after a check of all sizes that they declare.
  * @param {Container} container of a merged file that is complete
  * @returns {{name: string, container: Container}[]}
- * @throws {HyrfFormatError} a part is missing or damaged, is itself a merged file, or the parts declare too many bytes
+ * @throws {HyrfFormatError} a part is missing or damaged, is itself a merged file, or refers to another file; or the
+ *   parts declare too many bytes
  */
 export const openParts = (container) => {
   let declared = 0;
@@ -60,7 +62,10 @@ export const openParts = (container) => {
     if (entry.codec !== CODEC_FILE || entry.raw !== entry.stored) rejectNewer(`section '${type}' is no file`);
     const part = new Container(container.stored(type), false);
     if (part.entries.has(PART_NAMES_TYPE)) rejectDamaged(`section '${type}' is a merged file itself`);
-    for (const { raw } of part.entries.values()) declared += raw;
+    for (const { codec, raw } of part.entries.values()) {
+      if (codec === CODEC_SHARED) rejectDamaged(`section '${type}' refers to another file`);
+      declared += raw;
+    }
     return { name, container: part };
   });
   if (declared > rawBytesLimit(container.length)) rejectDamaged("its parts say that they decode to too many bytes");

@@ -1,6 +1,6 @@
 // Decodes streams of tokens (docs/reference/format.md 3.1), which are coded by interleaved rANS.
 
-import { assertValid } from "./errors.js";
+import { HyrfFormatError, assertValid } from "./errors.js";
 
 const MAX_ALPHABET_TOKENS = 126;
 const MAX_MODELS = 1024;
@@ -41,13 +41,16 @@ const countContexts = (contexts) => {
  */
 export const decodeTokens = (data, count, contexts, mayBeStatic = true) => {
   if (count === 0) return { tokens: new Uint8Array(0), end: 0 };
-  assertValid(data.length >= 2 && count < MAX_TOKEN_COUNT, "a stream ends within its header");
+  if (count >= MAX_TOKEN_COUNT) {
+    throw new HyrfFormatError("The model has 2^31 or more numbers in a section, too many for this reader.");
+  }
+  assertValid(data.length >= 2, "a stream ends within its header");
   const alphabet = data[1], contextCount = countContexts(contexts);
   if (alphabet === 0) return decodeConstantTokens(data, count, contexts, contextCount);
   const lanesLog2 = data[0] & 15, classes = ((data[0] >> 4) & 7) + 1, isStatic = data[0] >= 128;
   const models = contextCount * classes;
   const isKnown = alphabet <= MAX_ALPHABET_TOKENS && models <= MAX_MODELS && lanesLog2 <= MAX_LANES_LOG2;
-  assertValid(isKnown && (mayBeStatic || !isStatic), "a stream's header says what cannot be");
+  assertValid(isKnown && (mayBeStatic || !isStatic), "a stream's header has invalid values");
   const areLanesEnough = count <= MAX_STEPS_PER_LANE * 2 ** lanesLog2 || lanesLog2 === MAX_LANES_LOG2;
   assertValid(areLanesEnough, "a stream has too few lanes");
   let place = 2 + classes - 1;

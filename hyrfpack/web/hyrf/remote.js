@@ -27,13 +27,13 @@ import { HyrfError, HyrfFormatError } from "./errors.js";
  *   exposure: import("./exposure.js").ExposureMap | null,
  * }} RemotePart
  *
- * What can be opened: an address (relative to the page), or the content of a file.
+ * What can be opened: an address (relative to that of the page or worker), or the content of a file.
  * @typedef {string | URL | Blob | ArrayBuffer | Uint8Array} Source
  *
  * `name` is the file's name for error messages; by default it is the end of the address. `onProgress` is called with
- * the part (0 to 1) of the step "loading" or "decoding" that is done. `signal` cancels the opening. `createWorker`
- * starts the worker from `remote_worker.js`, where bundlers do not find it by themselves or the script is on another
- * site.
+ * the part (0 to 1) of the file that is loaded, and once, with 0, when decoding begins. `signal` cancels the opening.
+ * `createWorker` starts the worker from `remote_worker.js`, where bundlers do not find it by themselves or the script
+ * is on another site.
  * @typedef {{
  *   name?: string,
  *   onProgress?: (progress: {step: "loading" | "decoding", part: number}) => void,
@@ -117,7 +117,9 @@ export class RemoteModel {
   static async open(source, options) {
     const { name = nameOf(source), signal } = options;
     signal?.throwIfAborted();
-    const request = await describeSource(source);
+    const request = await describeSource(source).catch((/** @type {Error} */ { message }) => {
+      throw new HyrfError(`${name}: It cannot be read (${message}); check the address or the file.`);
+    });
     signal?.throwIfAborted();
     const model = new RemoteModel(name, options), abort = () => model.#fail(signal?.reason);
     signal?.addEventListener("abort", abort, { once: true });
@@ -211,7 +213,7 @@ const describeWorkerError = (name, reason) =>
  * @param {Source} source
  */
 function nameOf(source) {
-  if (typeof source !== "string" && !(source instanceof URL)) return /** @type {File} */ (source).name ?? "the file";
+  if (typeof source !== "string" && !(source instanceof URL)) return /** @type {File} */ (source)?.name ?? "the file";
   const path = String(source).split(/[?#]/)[0];
   return decodeName(path.split("/").pop() || path);
 }
@@ -234,8 +236,9 @@ function decodeName(name) {
  */
 async function describeSource(source) {
   if (typeof source === "string" || source instanceof URL) {
-    return { address: new URL(source, globalThis.document?.baseURI ?? import.meta.url).href };
+    return { address: new URL(source, globalThis.document?.baseURI ?? globalThis.location?.href).href };
   }
   const bytes = source instanceof Blob ? await source.arrayBuffer() : source;
+  if (bytes?.byteLength === undefined) throw new TypeError("neither an address nor the content of a file");
   return { bytes: new Uint8Array(bytes) };
 }

@@ -1,7 +1,7 @@
 // The script of the worker that remote.js starts: reads a model and evaluates it for the latest view.
 //
 // Messages to the worker:
-//     {open: {name, address | bytes}}   the model: an address to fetch, or its bytes
+//     {open: {address | bytes}}         the model: an address to fetch, or its bytes
 //     {look: {ticket, view}}            the view to evaluate; it replaces earlier ones
 //     {spare}                           the array of an order that is no longer needed
 // Messages from the worker:
@@ -12,7 +12,8 @@
 //     {complete: ticket}                everything that the view needs was sent
 //     {error: {message, isFormat}}      a sentence for the user
 
-import { HyrfError, HyrfFormatError } from "./errors.js";
+import { HEADER_BYTES, MAGIC_BYTES, readUint64 } from "./container.js";
+import { HyrfError, HyrfFormatError, explainMemory, groupedDigits } from "./errors.js";
 import { readParts } from "./index.js";
 import { MergedEvaluator } from "./merged_evaluator.js";
 
@@ -56,9 +57,8 @@ self.onmessage = ({ data: message }) => {
  */
 function report(work) {
   work.catch((/** @type {Error} */ error) => {
-    const isOutOfMemory = error instanceof RangeError; // thrown for arrays that are too long
-    const message = isOutOfMemory ? "The model takes more memory than there is; open a smaller one." : error.message;
-    post({ error: { message, isFormat: error instanceof HyrfFormatError } });
+    const explained = explainMemory(error);
+    post({ error: { message: explained.message, isFormat: explained instanceof HyrfFormatError } });
   });
 }
 
@@ -79,30 +79,50 @@ async function open({ address, bytes = new Uint8Array(0) }) {
 }
 
 /**
- * Fetches a file and reports the progress.
+ * Fetches a file and reports the progress. The rest of what is no file, or is longer than its header says, is not
+ * fetched.
  * @param {string} address
  */
 async function fetchBytes(address) {
-  const unreachable = () =>
-    new HyrfError("It cannot be fetched; check the address, and whether its server allows this page to read it.");
-  const response = await fetch(address).catch(() => Promise.reject(unreachable()));
+  const response = await fetch(address).catch(() => {
+    throw new HyrfError("It cannot be fetched; check the address, and whether its server allows this page to read it.");
+  });
   if (!response.ok || !response.body) {
     throw new HyrfError(`Its server answers with the status ${response.status}; check the address.`);
   }
-  const length = Number(response.headers.get("Content-Length")), reader = response.body.getReader();
+  const reader = response.body.getReader();
   /** @type {Uint8Array[]} */
   const parts = [];
-  let received = 0, reported = 0;
-  for (;;) {
-    const { done, value } = await reader.read().catch(() => Promise.reject(unreachable()));
-    if (done) break;
+  let received = 0, reported = 0, length = Infinity;
+  while (received <= length) {
+    const { done, value } = await reader.read().catch(() => {
+      throw new HyrfError(`The connection was lost after ${groupedDigits(received)} bytes; open it again.`);
+    });
+    if (done) return joinBytes(parts, received);
     parts.push(value);
     received += value.length;
-    if (!length || performance.now() < reported + PROGRESS_INTERVAL_MS) continue;
+    if (length === Infinity && received >= HEADER_BYTES) length = declaredLength(joinBytes(parts, received));
+    if (performance.now() < reported + PROGRESS_INTERVAL_MS) continue;
     reported = performance.now();
     post({ progress: { step: "loading", part: Math.min(1, received / length) } });
   }
-  const bytes = new Uint8Array(received);
+  reader.cancel();
+  return joinBytes(parts, received);
+}
+
+/**
+ * Returns the length of a file by its header, or 0 if it is no `.hyrf` file.
+ * @param {Uint8Array} bytes its start
+ */
+const declaredLength = (bytes) =>
+  MAGIC_BYTES.every((byte, i) => bytes[i] === byte) ? readUint64(new DataView(bytes.buffer), 16) : 0;
+
+/**
+ * @param {Uint8Array[]} parts
+ * @param {number} length the sum of their lengths
+ */
+function joinBytes(parts, length) {
+  const bytes = new Uint8Array(length);
   let at = 0;
   for (const part of parts) {
     bytes.set(part, at);

@@ -38,8 +38,9 @@ export const sharedFileName = (container) => {
  * @throws {HyrfFormatError} the other file is not valid, or is not the one that was referred to
  */
 export const attachShared = (container, name, bytes) => {
-  const shared = openFiles.get(bytes) ?? explainShared(name, () => new Container(bytes, false));
+  const shared = openFiles.get(bytes) ?? explainShared({ name }, () => new Container(bytes, false));
   openFiles.set(bytes, shared);
+  shared.name = name;
   for (const { type, checksum } of listReferences(container)) {
     const entry = shared.entries.get(type);
     if (!entry || entry.codec === CODEC_SHARED || entry.checksum !== checksum) {
@@ -50,16 +51,16 @@ export const attachShared = (container, name, bytes) => {
 };
 
 /**
- * Returns the result of `read`. An error about the file `name` gets that name.
+ * Returns the result of `read`. An error about a file to which others refer gets its name.
  * @template Result
- * @param {string} name
+ * @param {{name: string}} file
  * @param {() => Result} read
  */
-const explainShared = (name, read) => {
+export const explainShared = ({ name }, read) => {
   try {
     return read();
   } catch (error) {
-    throw error instanceof HyrfFormatError ? new HyrfFormatError(`${name}: ${error.message}`) : error;
+    throw name && error instanceof HyrfFormatError ? new HyrfFormatError(`${name}: ${error.message}`) : error;
   }
 };
 

@@ -88,6 +88,44 @@ def test_modules_import_only_each_other_and_use_no_browser_objects():
         assert not re.search(r"\b(document|window|eval|require)\b[.(]", code), module.name
 
 
+def test_only_a_failed_allocation_is_reported_as_too_little_memory():
+    code = """
+        import { explainMemory } from "./errors.js";
+        const attempts = [
+          () => new ArrayBuffer(2 ** 52), () => new Uint8Array(2 ** 52), () => new Float32Array(-1),
+          () => new DataView(new ArrayBuffer(1)).getUint32(0), () => (1).toFixed(999),
+          function recurse() { recurse(); },
+        ];
+        const messages = attempts.map((attempt) => {
+          try { return attempt(); } catch (error) { return explainMemory(error).message; }
+        });
+        console.log(JSON.stringify(messages.map((message) => message.includes("more memory than there is"))));"""
+
+    assert run_module(code, PACKAGE_FOLDER) == [True, True, True, False, False, False]
+
+
+def test_a_section_of_2_to_the_31_numbers_is_refused_for_its_size():
+    code = """
+        import { decodeTokens } from "./rans.js";
+        try { decodeTokens(new Uint8Array(9), 2 ** 31, null); } catch ({ name, message }) {
+          console.log(JSON.stringify([name, message]));
+        }"""
+
+    name, message = run_module(code, PACKAGE_FOLDER)
+
+    assert name == "HyrfFormatError" and "2^31" in message and "damaged" not in message
+
+
+def test_levels_are_chosen_by_one_limit():
+    code = """
+        import { selectLevels } from "./levels.js";
+        try { selectLevels({}, {}, { gaussians: 1, bytes: 1 }); } catch ({ name, message }) {
+          console.log(JSON.stringify([name, message]));
+        }"""
+
+    assert run_module(code, PACKAGE_FOLDER) == ["TypeError", "Give `gaussians` or `bytes`, not both."]
+
+
 def test_the_packed_and_installed_package_reads_a_file(npm, tmp_path):
     listed = subprocess.run(
         [npm, "pack", "--dry-run", "--json"], cwd=PACKAGE_FOLDER, capture_output=True, text=True, check=True

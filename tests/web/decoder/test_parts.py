@@ -57,7 +57,11 @@ def test_a_file_of_one_model_is_read_as_its_only_part(tmp_path: Path):
 def test_forged_and_damaged_merged_files_are_refused(tmp_path: Path):
     files = [*FORGED_FILES.values(), MERGED[:-8], MERGED[:-1] + b"\1", (GOLDEN_FOLDER / "sizes.json").read_bytes()]
 
-    assert all("refused" in answer for answer in read_in_javascript(tmp_path, files))
+    answers = read_in_javascript(tmp_path, files)
+
+    assert all("refused" in answer for answer in answers)
+    refusals = dict(zip(FORGED_FILES, answers, strict=False))
+    assert "'PT01' refers to another file" in refusals["a part refers to another file"]["refused"]
 
 
 def test_names_that_are_not_valid_are_refused(tmp_path: Path):

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -120,12 +123,61 @@ def test_the_background_is_delivered_whole_and_then_in_tiles(page: Browser):
         ("damaged.hyrf", "damaged.hyrf: The file"),
         ("absent%20scene.hyrf?a=b", "absent scene.hyrf: Its server answers with the status 404; check the address."),
         ("http://127.0.0.1:9/far.hyrf", "far.hyrf: It cannot be fetched; check the address"),
+        ("http://[", "[: It cannot be read ("),
     ],
 )
 def test_errors_are_sentences_that_name_the_file(page: Browser, source: str, sentence: str):
     name, message = open_model(page, source)
     assert name == ("HyrfFormatError" if source == "damaged.hyrf" else "HyrfError")
     assert message.startswith(sentence)
+
+
+@pytest.mark.in_turn
+@pytest.mark.parametrize("source", ["undefined", "null", "5", "{}"])
+def test_a_source_that_is_none_is_refused(page: Browser, source: str):
+    name, message = page.evaluate(f"openRemoteModel({source}).catch(({{ name, message }}) => [name, message])")
+    assert name == "HyrfError" and message.startswith("the file: It cannot be read (neither an address nor ")
+
+
+class InterruptedDownloads(BaseHTTPRequestHandler):
+    """Sends the starts of files, and then nothing, or bytes without an end."""
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        self.send_header("Access-Control-Allow-Origin", "*")
+        start = (GOLDEN_FOLDER / "trained" / FILE_NAME).read_bytes()
+        if self.path == "/lost.hyrf":
+            self.send_header("Content-Length", str(len(start)))
+        self.end_headers()
+        with suppress(ConnectionError):
+            if self.path != "/other.hyrf":
+                self.wfile.write(start[:20_000] if self.path == "/lost.hyrf" else start)
+            while self.path != "/lost.hyrf":
+                self.wfile.write(b"more" * 10_000)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.mark.in_turn
+@pytest.mark.parametrize(
+    ("name", "sentences"),
+    [
+        # Firefox takes a lost connection for the end of the file.
+        ("lost.hyrf", ("The connection was lost after ", "The file is truncated: ")),
+        ("other.hyrf", ("This is not a .hyrf file",)),
+        ("longer.hyrf", ("The file is damaged: its header says ",)),
+    ],
+)
+def test_a_download_that_breaks_or_does_not_end_is_refused(page: Browser, name: str, sentences: tuple[str, ...]):
+    server = ThreadingHTTPServer(("127.0.0.1", 0), InterruptedDownloads)
+    Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        _, message = open_model(page, f"http://127.0.0.1:{server.server_port}/{name}")
+    finally:
+        server.shutdown()
+        server.server_close()
+    assert message.startswith(tuple(f"{name}: {sentence}" for sentence in sentences))
 
 
 @pytest.mark.in_turn

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import shutil
+import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -95,6 +97,29 @@ def test_references_that_python_refuses_are_refused(tmp_path: Path):
         assert "refused" in answer and "\n" not in answer["refused"], name
         with pytest.raises(HyrfFormatError):
             load_model(path)
+
+
+def test_errors_in_the_shared_file_name_it(tmp_path: Path):
+    """Sections are damaged under right checksums, which the references have, too, or have a wrong checksum."""
+    chunk, shared = ((GOLDEN_SCENE_FOLDER / name).read_bytes() for name in (CHUNK_FILE_NAME, SHARED_FILE_NAME))
+
+    def flip(tag: str) -> bytes:
+        place = read_container(shared).entries[tag].offset
+        return shared[:place] + bytes([shared[place] ^ 1]) + shared[place + 1 :]
+
+    damaged = with_section(shared, "GTAB", damage)
+    reference = zlib.crc32(read_container(damaged)["GTAB"].data).to_bytes(4, "little")
+    refer = rename(SHARED_FILE_NAME.encode())
+    other = with_section(
+        chunk, "GTAB", lambda section: refer(replace(section, data=reference + bytes(section.data[4:])))
+    )
+    paths = make_folders(tmp_path, [chunk, chunk, chunk, other], [*map(flip, ("META", "GTAB", "EXPO")), damaged])
+
+    answers = run_script(READ_CHUNKS_SCRIPT, *paths)
+
+    for tag, answer in zip(("META", "GTAB", "EXPO"), answers, strict=False):
+        assert answer["refused"].startswith(f"shared.hyrf: The file is damaged: the checksum of section '{tag}'")
+    assert answers[3]["refused"].startswith("shared.hyrf: Section 'GTAB' is damaged: ")
 
 
 def test_damaged_groups_of_a_table_are_refused(tmp_path: Path):

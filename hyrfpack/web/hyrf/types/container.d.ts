@@ -57,6 +57,8 @@ export declare class Container {
     entries: Map<string, Entry>;
     /** The file that holds the sections of codec 12, once it is known. @type {Container | null} */
     shared: Container | null;
+    /** The name of this file, if another one refers to it. */
+    name: string;
     /** Results of decoding that files which refer to this one need, too. @type {Map<string, any>} */
     decoded: Map<string, any>;
     /**

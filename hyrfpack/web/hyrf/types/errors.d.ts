@@ -30,6 +30,11 @@ export declare const rejectNewer: (what: string) => never;
  */
 export declare const assertValid: (holds: boolean, what: string) => void;
 /**
+ * Returns an error, or one with a clear message in place of that for an array that is too long for the memory.
+ * @param {any} error
+ */
+export declare const explainMemory: (error: any) => any;
+/**
  * Quotes text from a file for a message: at most 40 characters, on one line, in ASCII.
  * @param {string} text
  */

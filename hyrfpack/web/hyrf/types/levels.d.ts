@@ -15,6 +15,7 @@ export type LevelSelection = {
  *   `gaussians`: the most Gaussians, or `bytes`: the most bytes of files, with the shared files. Levels that are not
  *   available are not chosen.
  * @returns {LevelSelection}
+ * @throws {TypeError} both limits are given
  */
 export declare const selectLevels: (manifest: Manifest, camera: Camera, { gaussians, bytes, isAvailable }?: {
     gaussians?: number;
