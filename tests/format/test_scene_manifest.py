@@ -79,7 +79,7 @@ def test_a_manifest_is_nested_as_deep_as_a_file_may_be():
     def nested(depth: int) -> Any:
         return {} if depth == 0 else {"a": nested(depth - 1)}
 
-    parse_manifest(with_value(["frame"], nested(62)))
+    parse_manifest(with_value(["viewpoint"], nested(62)))
     for key in ("frame", "viewpoint", "unknown"):
         for depth in (63, 64, 700):
             with pytest.raises(HyrfFormatError, match="nested deeper than 64 levels"):

@@ -174,7 +174,7 @@ export class Container {
       if (flags & 1 && !KNOWN_TYPES.has(type)) rejectNewer(`it requires section '${type}', which is unknown`);
       if (flags > 1 || table.getUint32(at + 36, true)) rejectDamaged(`section '${type}' sets reserved bits`);
       const offset = readUint64(table, at + 8), stored = readUint64(table, at + 16), raw = readUint64(table, at + 24);
-      if (offset !== end) rejectDamaged(`section '${type}' does not start where the one before it ends`);
+      if (offset !== end) rejectDamaged(`section '${type}' is at a wrong place`);
       if (stored > this.length - offset) rejectDamaged(`section '${type}' does not fit into the file`);
       end = offset + paddedLength(stored);
       const codec = table.getUint16(at + 4, true), checksum = table.getUint32(at + 32, true);

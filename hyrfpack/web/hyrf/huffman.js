@@ -21,20 +21,20 @@ const MAX_LOOKUP_BITS = 12; // longer codes are found by binary search
  * @throws {DamagedData} the stream is damaged, or has another number of symbols
  */
 export const decodeHuffman = (data, count) => {
-  assertValid(data.length >= HUFFMAN_HEADER_BYTES, "a Huffman stream ends within its header");
+  assertValid(data.length >= HUFFMAN_HEADER_BYTES, "a Huffman stream has another length");
   const view = new DataView(data.buffer, data.byteOffset, data.length);
   const packedBytes = readUint64(view, 8), leaves = view.getUint32(16, true), endMark = view.getUint32(20, true);
   const symbolBytes = data[24], sizeBytes = data[25];
   const areWidthsKnown = (symbolBytes === 1 || symbolBytes === 2) && (sizeBytes === 2 || sizeBytes === 4);
   const isKnown = areWidthsKnown && leaves <= 256 ** symbolBytes + 1;
   assertValid(isKnown && endMark <= Math.max(leaves - 1, 0), "the header of a Huffman stream has invalid values");
-  assertValid(readUint64(view, 0) === count, `a Huffman stream codes another number of symbols than ${count}`);
+  assertValid(readUint64(view, 0) === count, `a Huffman stream has another number of symbols than ${count}`);
   const isPossible = count <= 8 * packedBytes && count > 0 === packedBytes > 0 && (leaves > 0 || count === 0);
-  assertValid(isPossible, "a Huffman stream codes more symbols than its bytes can");
+  assertValid(isPossible, "a Huffman stream has too many symbols");
   const chunkLength = Math.max(1024, 2 * Math.ceil(count / 2048)), chunks = Math.ceil(count / chunkLength);
   const symbolsAt = HUFFMAN_HEADER_BYTES + leaves, sizesAt = symbolsAt + Math.max(leaves - 1, 0) * symbolBytes;
   const packedAt = sizesAt + chunks * sizeBytes;
-  assertValid(packedAt + packedBytes === data.length, "a Huffman stream has more or fewer bytes than it announces");
+  assertValid(packedAt + packedBytes === data.length, "a Huffman stream has another length");
 
   const symbols = new Int32Array(leaves);
   for (let leaf = 0, at = symbolsAt; leaf < leaves; leaf++) {
@@ -46,7 +46,7 @@ export const decodeHuffman = (data, count) => {
     sizeBytes === 2 ? view.getUint16(sizesAt + 2 * chunk, true) : view.getUint32(sizesAt + 4 * chunk, true),
   );
   const bits = sizes.reduce((sum, size) => sum + size, 0);
-  assertValid(Math.ceil(bits / 8) === packedBytes, "the chunks of a Huffman stream do not add up to its bytes");
+  assertValid(Math.ceil(bits / 8) === packedBytes, "a Huffman stream has another length");
   return decodeChunks(data.subarray(packedAt), count, chunkLength, sizes, code);
 };
 
@@ -134,12 +134,12 @@ const decodeChunks = (packed, count, chunkLength, sizes, code) => {
       const next = bitsAt(at);
       let leaf = table[next >>> (32 - lookupBits)];
       if (leaf < 0) leaf = findLeaf(code, next, bitsAt(at + 32));
-      assertValid(symbols[leaf] >= 0, "the end mark of a Huffman stream comes too early");
+      assertValid(symbols[leaf] >= 0, "a chunk of a Huffman stream is damaged");
       decoded[i] = symbols[leaf];
       at += lengths[leaf];
-      assertValid(at <= end, "a chunk of a Huffman stream ends elsewhere than its size says");
+      assertValid(at <= end, "a chunk of a Huffman stream is damaged");
     }
-    assertValid(at === end, "a chunk of a Huffman stream ends elsewhere than its size says");
+    assertValid(at === end, "a chunk of a Huffman stream is damaged");
   }
   return decoded;
 };

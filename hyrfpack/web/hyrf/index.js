@@ -234,9 +234,7 @@ const sourceOf = (container, type) => {
   if (!container.has(type)) rejectIncomplete(container, requireEntry(container, type).end);
   if (container.shared) return container.shared;
   const name = sharedFileName(container);
-  throw new HyrfFormatError(
-    `The file needs the file ${name} of its folder; open the scene.json of that folder, or call read with openFile.`,
-  );
+  throw new HyrfFormatError(`The file needs ${name}; open scene.json of its folder, or call read with openFile.`);
 };
 
 /**
@@ -307,6 +305,8 @@ const checkSection = (container, { type, rows, columns }) => {
   explainShared(source, () => {
     if (!PARAMETER_CODECS.includes(codec)) rejectNewer(`section '${type}' has the codec ${codec}, which is unknown`);
     if (raw !== 4 * rows * columns) rejectDamaged(`section '${type}' says another size than the metadata`);
+    // The groups of a table would follow from the Gaussians of the other file.
+    if (source !== container && codec === CODEC_GROUPS && columns > 1) rejectDamaged(`section '${type}' has codec 8`);
   });
 };
 
@@ -328,8 +328,7 @@ const decodeSection = (container, section, config, points) => {
       }
       return numbers;
     });
-  // Where groups follow from positions, they are those of this file.
-  if (source === container || (codec === CODEC_GROUPS && section.columns > 1)) return decode();
+  if (source === container) return decode();
   const { geometry, radiance, hidden, direction_encoding } = config; // they determine the section's shape
   return decodeOnce(source, JSON.stringify([type, geometry, radiance, hidden, direction_encoding]), decode);
 };

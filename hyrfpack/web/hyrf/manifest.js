@@ -4,7 +4,7 @@
 import { MAX_PARTS } from "./container.js";
 import { DamagedData, HyrfFormatError, assertValid, groupedDigits, quotedText } from "./errors.js";
 import { MAX_QUAT_LENGTH_ERROR } from "./metadata.js";
-import { arePartNames } from "./parts.js";
+import { CONTROL_CHARACTERS, arePartNames } from "./parts.js";
 import { IDENTITY_QUAT } from "./rotation.js";
 import { isFileName } from "./shared.js";
 
@@ -40,8 +40,7 @@ const MAX_ERROR_RADII = 16;
 const MAX_CAMERAS = 1024, MAX_CAMERA_NUMBERS = 32;
 const MAX_TEXT_LENGTH = 1000;
 const INTEGER_LIMIT = 2 ** 40;
-// Control characters and separators, which Python does not print.
-const UNPRINTABLE = /(?! )[\p{C}\p{Z}]/u;
+const MAX_FILE_BYTES = 2 ** 34;
 
 /**
  * Parses a manifest.
@@ -120,7 +119,7 @@ const checkManifest = (values, leastParts) => {
   for (const camera of values.cameras) checkNumbers(camera, "cameras", 1, MAX_CAMERA_NUMBERS);
   for (const key of ["title", "licence", "writer"]) {
     const text = values[key];
-    const isText = typeof text === "string" && [...text].length <= MAX_TEXT_LENGTH && !UNPRINTABLE.test(text);
+    const isText = typeof text === "string" && [...text].length <= MAX_TEXT_LENGTH && !CONTROL_CHARACTERS.test(text);
     assertValid(isText, `'${key}' must be a text of at most ${MAX_TEXT_LENGTH} characters`);
   }
   checkInteger(values.gaussians, "gaussians");
@@ -188,6 +187,7 @@ const checkFile = (file, key) => {
     throw new DamagedData(`${name} is not the name of a .hyrf file in the folder`);
   }
   checkInteger(file.bytes, "bytes");
+  assertValid(file.bytes <= MAX_FILE_BYTES, "'bytes' is out of range");
   const isChecksum = typeof file.crc32 === "string" && /^[0-9a-f]{8}$/.test(file.crc32);
   assertValid(isChecksum, `the checksum of ${file.file} is not 8 hexadecimal digits`);
 };

@@ -8,7 +8,7 @@ const CODEC_NAMES = 0;
 const CODEC_FILE = 10;
 const MAX_NAMES_BYTES = 2 ** 16;
 const MAX_NAME_LENGTH = 64;
-const CONTROL_CHARACTERS = /[\u0000-\u001f\u007f-\u009f\u2028\u2029\ud800-\udfff]/u;
+export const CONTROL_CHARACTERS = /[\u0000-\u001f\u007f-\u009f\u2028\u2029\ud800-\udfff]/u;
 
 /**
  * Reads the names of a merged file's parts.

@@ -42,7 +42,7 @@ const countContexts = (contexts) => {
 export const decodeTokens = (data, count, contexts, mayBeStatic = true) => {
   if (count === 0) return { tokens: new Uint8Array(0), end: 0 };
   if (count >= MAX_TOKEN_COUNT) {
-    throw new HyrfFormatError("The model has 2^31 or more numbers in a section, too many for this reader.");
+    throw new HyrfFormatError("The model is too large for this reader; open a smaller one.");
   }
   assertValid(data.length >= 2, "a stream ends within its header");
   const alphabet = data[1], contextCount = countContexts(contexts);

@@ -23,6 +23,7 @@
 //     {error}                                the reason, as soon as it is certain that the file cannot be read
 //     {failure}                              the reason why another message could not be handled
 
+import { explainMemory } from "../hyrf/errors.js";
 import { fitHarmonics } from "../hyrf/harmonics.js";
 import { read, readParts } from "../hyrf/index.js";
 import { toLocalView, viewpointOf } from "../hyrf/viewpoint.js";
@@ -52,7 +53,7 @@ export function startWorker(readSplats, Stream = null) {
     try {
       service.handle(message);
     } catch (error) { // other readers go on
-      service.post({ failure: describeError(error) });
+      service.post({ failure: explainMemory(error).message });
     }
   };
 }
@@ -90,7 +91,7 @@ class Service {
       const value = select ? await this.select(select) : decode ? { model: await read(bytes), kept } : bytes;
       this.post({ answer: { ticket, value } });
     } catch (error) {
-      this.post({ answer: { ticket, error: describeError(error) } });
+      this.post({ answer: { ticket, error: explainMemory(error).message } });
     }
   }
 
@@ -102,11 +103,6 @@ class Service {
     sorter.kept = kept;
     return counts;
   }
-}
-
-function describeError(error) {
-  const isOutOfMemory = error instanceof RangeError; // thrown for arrays that are too long
-  return isOutOfMemory ? "There is not enough memory; open a smaller file." : error.message;
 }
 
 // Reads one file and posts its contents: the first layer alone if the rest takes long, and the whole.
@@ -135,7 +131,7 @@ class SceneReader {
       if (this.file.add(bytes)) setTimeout(() => this.queueDecoding(true), FIRST_LAYER_DELAY_MS);
     } catch (error) {
       this.isRejected = true;
-      this.post({ error: describeError(error) });
+      this.post({ error: explainMemory(error).message });
     }
   }
 
@@ -164,7 +160,7 @@ class SceneReader {
       .then(() => (partial && this.ended && !this.broken ? null : this.decode(partial)))
       .catch((error) => {
         this.broken = true; // `decodeAgain` then decodes only bytes that could be decoded before
-        this.post({ error: describeError(error) });
+        this.post({ error: explainMemory(error).message });
       });
   }
 

@@ -78,7 +78,9 @@ BAD_MANIFESTS = [
             (["frame", "rotation"], [1, 0, 0, 1]),
             (["cameras"], [[]]),
             (["title"], "two\nlines"),
+            (["title"], "half of a pair \ud83d"),
             (["licence"], "x" * 1001),
+            (["chunks", 0, "levels", 0, "bytes"], 2**34 + 1),
         ]
     ),
     *(
@@ -208,7 +210,16 @@ def test_levels_that_are_not_available_are_left_out(tmp_path: Path):
 def test_manifests_are_accepted_and_refused_as_in_python(tmp_path: Path):
     folders = (GOLDEN_SCENE_FOLDER, GOLDEN_PARTS_SCENE_FOLDER)
     golden = [(folder / "scene.json").read_bytes() for folder in folders]
-    good = [VALID_MANIFEST.to_json(), PARTS_MANIFEST.to_json(), LATER_VERSION, INTEGRAL_FLOATS, ROTATED, *golden]
+    titles = [with_value(["title"], title) for title in ("Salle\u00a012", "\u3000", "\U0001f469\u200d\U0001f680")]
+    good = [
+        VALID_MANIFEST.to_json(),
+        PARTS_MANIFEST.to_json(),
+        LATER_VERSION,
+        INTEGRAL_FLOATS,
+        ROTATED,
+        *titles,
+        *golden,
+    ]
 
     answers = run(tmp_path, [{"manifest": data} for data in good + BAD_MANIFESTS])
 

@@ -122,6 +122,19 @@ def test_errors_in_the_shared_file_name_it(tmp_path: Path):
     assert answers[3]["refused"].startswith("shared.hyrf: Section 'GTAB' is damaged: ")
 
 
+def test_a_table_whose_groups_depend_on_points_cannot_be_referred_to(tmp_path: Path):
+    """Codec 8 derives the groups of a table from the points of its own file, of which another file has others."""
+    chunk, shared = ((GOLDEN_SCENE_FOLDER / name).read_bytes() for name in (CHUNK_FILE_NAME, SHARED_FILE_NAME))
+    grouped = with_section(shared, "GTAB", lambda section: replace(section, codec=8))
+    paths = make_folders(tmp_path, [chunk], [grouped])
+
+    (answer,) = run_script(READ_CHUNKS_SCRIPT, *paths)
+
+    assert answer["refused"].startswith("shared.hyrf: The file is damaged: section 'GTAB' has codec 8")
+    with pytest.raises(HyrfFormatError, match="section 'GTAB' has codec 8"):
+        load_model(paths[0])
+
+
 def test_damaged_groups_of_a_table_are_refused(tmp_path: Path):
     """The reference has the checksum of the damaged section, so that only the decoder can find the damage."""
     shared = (GOLDEN_SCENE_FOLDER / SHARED_FILE_NAME).read_bytes()
@@ -141,4 +154,4 @@ def test_the_bytes_of_a_chunk_alone_are_refused_with_the_way_to_open_it():
 
     (verdict,) = read_in_javascript([(chunk, False)])
 
-    assert "needs the file shared.hyrf of its folder; open the scene.json" in verdict.refused
+    assert "needs shared.hyrf; open scene.json of its folder" in verdict.refused

@@ -7,7 +7,7 @@ import { commandText } from "./actions.js";
 import { keepsGaussians, rewriteFile, writeKept } from "./rewrite.js";
 
 const NOTHING_TEXT = "Nothing is edited yet.";
-const UNCOMPRESSED_TEXT = "Save .hyrf stores what is left uncompressed, as the command with --profile raw.";
+const UNCOMPRESSED_TEXT = "Save .hyrf stores it uncompressed, as the command with --profile raw.";
 
 export class SaveTool {
   constructor(editor) {

@@ -123,7 +123,7 @@ class StreamLoader extends Loader {
   }
 
   ask() {
-    const text = "A scene folder cannot be edited here; edit the file that hyrfpack decompress joins.";
+    const text = "A scene folder cannot be edited; edit the file that hyrfpack decompress joins.";
     return Promise.reject(new Error(text));
   }
 
