@@ -11,6 +11,7 @@ import hmac
 import logging
 import secrets
 import socket
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from threading import Lock, Thread
@@ -18,6 +19,8 @@ from threading import Lock, Thread
 _LOG = logging.getLogger(__name__)
 
 CONNECT_SECONDS = 60.0
+# A process sends its token and rank as soon as it is connected. Others are not waited for.
+GREETING_SECONDS, MAX_GREETING_BYTES = 5.0, 64
 # A machine that is switched off closes no connection. The system then sends probes: the first after 30 s without data,
 # and after 6 of them without an answer, 10 s apart, the connection counts as closed.
 KEEPALIVE_OPTIONS = {"TCP_KEEPIDLE": 30, "TCP_KEEPINTVL": 10, "TCP_KEEPCNT": 6}
@@ -127,14 +130,29 @@ def _accept(server: socket.socket, size: int, token: str) -> dict[int, socket.so
                 f"only {len(connections)} of {size - 1} other processes are watched; if one ends, this may hang"
             )
             break
-        connection.settimeout(CONNECT_SECONDS)
-        with suppress(OSError):
-            given, _, rank = connection.makefile().readline().strip().partition(" ")
-            if hmac.compare_digest(given.encode(), token.encode()) and rank.isdigit() and 0 < int(rank) < size:
+        with suppress(OSError, ValueError):
+            given, _, rank = _read_greeting(connection).partition(b" ")
+            if hmac.compare_digest(given, token.encode()) and 0 < int(rank) < size:
                 connections[int(rank)] = _keep_alive(connection)
                 continue
         connection.close()
     return connections
+
+
+def _read_greeting(connection: socket.socket) -> bytes:
+    """Read the first line of a connection, which anyone may have opened: at most so many bytes, and not for long.
+
+    Raises:
+        OSError: the line did not arrive in time.
+    """
+    deadline, line = time.monotonic() + GREETING_SECONDS, b""
+    while not line.endswith(b"\n") and len(line) < MAX_GREETING_BYTES:
+        connection.settimeout(max(1e-3, deadline - time.monotonic()))
+        received = connection.recv(MAX_GREETING_BYTES - len(line))
+        if not received:
+            break
+        line += received
+    return line.strip()
 
 
 def _keep_alive(connection: socket.socket) -> socket.socket:

@@ -127,7 +127,7 @@ class Ranks:
         """Run a function on every rank and return this rank's result, if it succeeded on all of them.
 
         Raises:
-            HyrfError: the function raised one on some rank; all ranks raise the error of the lowest such rank.
+            HyrfError: the function raised one on some rank; all ranks raise that of the lowest such rank, of its type.
         """
         if self.is_single:
             return work()
@@ -159,13 +159,13 @@ class Ranks:
         Raises:
             HyrfError: some rank has an error.
         """
-        errors = self.all_gather(None if problem is None else (problem.problem, problem.fix))
-        failed = [(rank, *error) for rank, error in enumerate(errors) if error is not None]
+        errors = self.all_gather(None if problem is None else problem.with_text())  # a copy without its traceback
+        failed = [(rank, error) for rank, error in enumerate(errors) if error is not None]
         if problem is not None and len(failed) == self.size:
             raise problem  # If all processes fail, each raises its own error, as a single process would.
         if failed:
-            rank, what, fix = failed[0]
-            raise HyrfError(f"process {rank} of {self.size}: {what}", fix=fix) from problem
+            rank, error = failed[0]
+            raise error.with_text(f"process {rank} of {self.size}: {error.problem}") from problem
 
     def raise_if_lost(self) -> None:
         """Raise an error if another process has ended. This is not collective.
@@ -255,11 +255,12 @@ def join_processes(environment: Mapping[str, str] | None = None) -> Iterator[Ran
             fix=hint,
         ) from error
     global _watch
-    _watch = connect_to_peers(ranks.rank, ranks.size, address, ranks.broadcast, _abort_gpu_communication)
     try:
+        _watch = connect_to_peers(ranks.rank, ranks.size, address, ranks.broadcast, _abort_gpu_communication)
         yield ranks
     except BaseException:
-        _watch.close(failed=True)
+        if _watch is not None:
+            _watch.close(failed=True)
         _abort_gpu_communication()  # Otherwise NCCL waits for operations that the other processes never join.
         raise
     else:

@@ -8,9 +8,8 @@ import os
 def thread_count() -> int:
     """Return the number of threads to use: HYRFPACK_THREADS, or else the number of available cores."""
     requested = os.environ.get("HYRFPACK_THREADS", "")
-    if requested.isdigit() and int(requested) > 0:
-        return int(requested)
-    return available_cores()
+    is_number = requested.isascii() and requested.isdigit()
+    return (int(requested) if is_number else 0) or available_cores()
 
 
 def available_cores() -> int:

@@ -25,6 +25,7 @@ from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.model.frame import Frame
 from hyrfpack.ops.adam import adam_step
+from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.scene import Camera, Picture, Scene, View
 from hyrfpack.train.exposure_map import ExposureFit, fit_exposure_map
 
@@ -209,10 +210,12 @@ class Exposures:
             wait for the device.
         """
         assert self.values.grad is not None
-        rows = self._stepped = sorted({self._row[view.name] for view in views})
+        photos = [self._row[view.name] for view in views]
+        rows = self._stepped = sorted(set(photos))
         for row in rows:
             self._steps[row] += 1
-        gradients = [self.values.grad[row] + GAIN_DECAY * self.values[row] for row in rows]
+        decay = GAIN_DECAY / len(photos)  # The gradients are those of the mean loss of all views.
+        gradients = [self.values.grad[row] + decay * self.values[row] for row in rows]
         values, *moments = ([tensor[row] for row in rows] for tensor in (self.values, self._exp_avg, self._exp_avg_sq))
         steps = [self._steps[row] for row in rows]
         broken = adam_step(values, gradients, *moments, step=steps, rate=rate, enabled=enabled).any()
@@ -273,9 +276,11 @@ def _spread_of(observed: Observations, gains: np.ndarray) -> float | None:
 
 
 def initialize_exposures(
-    scene: Scene, config: TrainConfig, cache: PictureCache, device: torch.device
+    scene: Scene, config: TrainConfig, cache: PictureCache, device: torch.device, ranks: Ranks = SINGLE_PROCESS
 ) -> tuple[Exposures | None, str]:
     """Estimate the per-image gains that a run starts from, if `config.exposure` is True.
+
+    Of several processes, all of which call this, the main one estimates them, so that they are the same on all.
 
     Returns:
         The gains, None if exposure compensation is off; and a description for the run's record.
@@ -291,7 +296,12 @@ def initialize_exposures(
             f"{scene.path}: per-image gains do not work with transparent photos, whose background has one exposure",
             fix="leave out `exposure`",
         )
+    gains, reason = ranks.run_on_main(lambda: _initial_gains(scene, cache))
+    return Exposures(scene.train, gains, device), f"per-image gains; {reason}"
+
+
+def _initial_gains(scene: Scene, cache: PictureCache) -> tuple[np.ndarray, str]:
+    """Return the log gains (N, 3) that tracks of the training photos show, and their spread in words."""
     observed = observe(scene, cache)
     gains = estimate_log_gains(observed, len(scene.train))
-    reason = describe_exposure_spread(_spread_of(observed, gains))
-    return Exposures(scene.train, gains, device), f"per-image gains; {reason}"
+    return gains, describe_exposure_spread(_spread_of(observed, gains))
