@@ -23,6 +23,9 @@ from hyrfpack.model.exposure import (
 POSITION_LENGTHS_RADII = (0.25, 0.5, 1.0, 2.0, 4.0)
 DIRECTION_LENGTHS_DEGREES = (15.0, 30.0, 60.0, 120.0)
 RIDGE_VARIANCES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
+# If the radius is a smaller multiple of the cameras' distance from the origin, or of 1, they are in one place up to
+# rounding, and the exposure depends on the direction alone.
+MIN_RADIUS_RATIO = 1e-6
 # A map is rejected if the bound of a log gain's change per degree of viewing angle, or per radius, is larger.
 MAX_SLOPE_PER_DEGREE = 0.15
 MAX_SLOPE_PER_RADIUS = 20.0
@@ -61,7 +64,9 @@ def fit_exposure_map(poses: Sequence[np.ndarray], log_gains: np.ndarray) -> Expo
     matrices = np.asarray(poses, np.float64)
     positions = -np.einsum("nji,nj->ni", matrices[:, :3, :3], matrices[:, :3, 3])
     directions = matrices[:, 2, :3]
-    radius = float(np.sqrt(np.square(positions - positions.mean(0)).sum(1).mean())) or 1.0
+    radius = float(np.sqrt(np.square(positions - positions.mean(0)).sum(1).mean()))
+    if radius <= MIN_RADIUS_RATIO * max(1.0, float(np.abs(positions).max())):
+        radius = 1.0
     candidates = []
     for length, angle in product(POSITION_LENGTHS_RADII, DIRECTION_LENGTHS_DEGREES):
         lengths = np.array([length * radius, 2 * np.sin(np.radians(angle) / 2)], np.float32)

@@ -54,6 +54,16 @@ def test_exposures_that_viewpoints_do_not_explain_become_their_mean():
     assert np.abs(predicted - gains.mean(0)).max() < 0.35 and fit.leave_one_out_error > 0.6
 
 
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.3, 0.2, 0.1), (10.0, 10.0, 10.0)])
+def test_exposures_of_a_camera_that_turns_on_the_spot_are_predicted(place):
+    angles = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    targets = np.array(place) + np.stack([np.cos(angles), np.sin(angles), np.zeros(40)], 1)
+    cameras = [camera_at(place, target=target) for target in targets]
+    gains = 0.5 * np.sin(angles)[:, None] * np.ones(3)
+    fit = fit_exposure_map(poses_of(cameras), gains)
+    np.testing.assert_allclose(predict_log_gains(cameras, fit), gains, atol=0.05)
+
+
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_a_map_can_be_fitted_to_few_photos(count):
     cameras = ring(count)
