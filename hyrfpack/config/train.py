@@ -71,17 +71,19 @@ class DensityConfig:
     """Settings of density control, which clones, splits and prunes Gaussians. Times are fractions of the run, 0 to 1.
 
     Attributes:
-        start, stop: times between which rounds take place.
-        peak: time at which the number of Gaussians is largest; it grows linearly until then, and falls linearly after.
+        start, stop: times between which rounds take place; there are none if `stop` comes before `start`.
+        peak: time from `start` to `stop` at which the number of Gaussians is largest; it grows linearly until then, and
+            falls linearly after.
         excess: largest number of Gaussians, in budgets, at least 1. Until `stop` those with the lowest importance are
             pruned, down to one budget. With 1 the number stays at the budget from `peak` on.
-        rounds: number of rounds, at least 1.
+        rounds: approximate number of rounds, at least 1. They are a whole number of steps apart, at least five.
         gradient: mean absolute gradient of a Gaussian's projected centre (NDC units) above which it is cloned or split.
         split_scale: a Gaussian with a larger scale (local units, divided by max(1, |u|)) is split instead of cloned.
         prune_opacity: Gaussians with a lower opacity are pruned.
         prune_scale: Gaussians with a larger scale (units of `split_scale`) are pruned, unless they are more than a
             tenth of all.
-        resets: number of opacity resets, evenly spread between `start` and `peak` (exclusive); 0 or more.
+        resets: approximate number of opacity resets, evenly spread between `start` and `peak`; 0 or more. None comes
+            within a round's interval before `peak`.
         reset_opacity: opacity that a reset caps all Gaussians at, between 0 and 1.
     """
 
@@ -102,8 +104,10 @@ class DensityConfig:
 
     def planned_counts(self, initial: int, budget: int) -> list[tuple[float, float]]:
         """Return the corners (time, number of Gaussians) of a run in which each round reaches its target number."""
-        most = self.excess * budget
-        return [(0, initial), (self.start, initial), (self.peak, most), (self.stop, budget), (1, budget)]
+        if self.stop < self.start:
+            return [(0, initial), (1, initial)]
+        most, peak = self.excess * budget, min(max(self.start, self.peak), self.stop)
+        return [(0, initial), (self.start, initial), (peak, most), (self.stop, budget), (1, budget)]
 
     def mean_count(self, initial: int, budget: int) -> float:
         """Return the mean number of Gaussians over a run in which each round reaches its target number."""
@@ -123,7 +127,8 @@ class TrainConfig:
     photos, or of at least 20,000 on 31 to 100, whether fewer steps are enough (`hyrfpack.train.length_pilots`). A
     `Trainer` by itself makes no pilot runs: it takes all steps, and learns no gains unless `exposure` is True. The hash
     grid whose rows `log2_table_size` states is that of radiance (None: by the budget); the geometry grid has half as
-    many. The background colour "random" is a new one in each step, and the model's own background is then black.
+    many, at least 2^4. The background colour "random" is a new one in each step, and the model's own background is then
+    black.
 
     Attributes:
         steps: training steps.
@@ -133,7 +138,7 @@ class TrainConfig:
             evaluate the background of photos that are not reduced at every third pixel.
         seed: random seed. On a CPU, the same seed gives the same file.
         preset: kind of scene; auto detects it.
-        max_gaussians: budget: the maximum number of Gaussians. Default: measured by pilot runs.
+        max_gaussians: budget: the number of Gaussians in the end, at most. Default: measured by pilot runs.
         budget_factor: the budget as a multiple of what pixels and steps suggest. Default: measured by pilot runs.
         target_bytes: choose the budget so that 'hyrfpack compress' reaches this file size, such as 500kB.
         surface_points: start with points on surfaces that photos show, beside those of the scene, up to the budget.
@@ -143,7 +148,7 @@ class TrainConfig:
         background_color: colour behind transparent photos.
         antialiased: antialiasing: dim small Gaussians as the pixel filter widens them.
         ssim_weight: weight w of SSIM in the loss (1 - w) L1 + w (1 - SSIM).
-        checkpoint_every: steps between checkpoints. Default: a twentieth of the run.
+        checkpoint_every: steps between checkpoints, each of one view per process. Default: a twentieth of the run.
         precision: precision of matrix products on a GPU: bfloat16 with float32 sums (mixed), or float32. The CPU always
             uses float32.
         direction_encoding: as in ModelConfig.

@@ -25,7 +25,7 @@ class Gaussians(nn.Module):
         scale_logits: (N, 1) explicit logit of the scale.
         opacity_logits: (N, 1) explicit logit of the opacity.
         shape_residuals, color_residuals: (N, 5) and (N, 3 K) corrections of what the fields predict, see
-            `hyrfpack.model.residuals`; None in a model without them. Training keeps them as they are.
+            `hyrfpack.model.residuals`; None in a model without them. Models with residuals are not trained.
         pixel_sizes: (N,) the size of a photo's pixel at each Gaussian, in local units, of the photo that shows it at
             the highest rate. None if the photos' cameras are not known, as in training. It is not trained, and files
             do not store it. `hyrfpack.render_view` samples the Gaussians no more finely.

@@ -76,9 +76,9 @@ def saved_decisions(path: Path) -> SavedDecisions:
         settings["budget_factor"].check(decisions.budget_factor)
         settings["steps"].check(decisions.steps)
     except ValueError as error:
-        raise _damaged(path) from error
+        raise damaged_checkpoint(path) from error
     if not isinstance(decisions.exposure, bool):
-        raise _damaged(path)
+        raise damaged_checkpoint(path)
     return decisions
 
 
@@ -113,10 +113,10 @@ def _read(path: Path) -> tuple[dict, dict[str, torch.Tensor], dict]:
         content = torch.load(io.BytesIO(data[:-DIGEST_BYTES]), weights_only=True, map_location="cpu")
         saved, progress = json.loads(content["settings"]), json.loads(content["progress"])
         tensors, version = content["tensors"], content["version"]
-        if not isinstance(saved, dict):
-            raise ValueError("the settings are no object")
+        if not all(isinstance(part, dict) for part in (saved, progress, tensors)):
+            raise ValueError("a part is no object")
     except Exception as error:  # torch's unpickler raises errors of any type
-        raise _damaged(path) from error
+        raise damaged_checkpoint(path) from error
     if version != CHECKPOINT_VERSION:
         raise HyrfTrainingError(
             f"{path}: the checkpoint is of another version of hyrfpack",
@@ -125,7 +125,8 @@ def _read(path: Path) -> tuple[dict, dict[str, torch.Tensor], dict]:
     return saved, tensors, progress
 
 
-def _damaged(path: Path) -> HyrfTrainingError:
+def damaged_checkpoint(path: Path) -> HyrfTrainingError:
+    """Return the error for a checkpoint that cannot be used."""
     return HyrfTrainingError(f"{path}: the checkpoint is damaged", fix="delete it and train anew")
 
 

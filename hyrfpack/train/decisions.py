@@ -20,7 +20,7 @@ from hyrfpack.train.exposure_pilots import (
     measure_exposure,
 )
 from hyrfpack.train.length_pilots import max_length_pilot_steps, measure_length, pilot_lengths
-from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, PilotScore, PilotsStopped, ScenePilots, step_cost
+from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, PilotScore, PilotsStopped, ScenePilots, pilot_step_cost
 from hyrfpack.train.trainer import Trainer
 
 # Shorter runs have no pilots, which would take too large a part of their time.
@@ -92,7 +92,7 @@ def max_exposure_pilot_steps(count: int, steps: int) -> float:
 
     Steps on reduced photos count less, see `Fold`.
     """
-    return 2 * exposure_rounds(count) * exposure_pilot_steps(steps) * step_cost(EXPOSURE_PILOT_REDUCTION)
+    return 2 * exposure_rounds(count) * exposure_pilot_steps(steps) * pilot_step_cost(EXPOSURE_PILOT_REDUCTION)
 
 
 def without_pilots(config: TrainConfig) -> Decisions:

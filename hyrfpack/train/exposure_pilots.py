@@ -91,13 +91,13 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
             gain, error = _mean_and_standard_error(gains)
             if abs(gain - limit) >= CLEAR_GAIN_STANDARD_ERRORS * error:
                 break
-    if len(gains) < 2:
+    if len(gains) < MIN_EXPOSURE_VALIDATION_VIEWS:
         return False, f"masks leave {len(gains)} of the validation photos, too few to measure whether gains help"
     gain, error = _mean_and_standard_error(gains)
-    is_significant = is_large or gain >= MIN_GAIN_STANDARD_ERRORS * error
-    return len(gains) >= MIN_EXPOSURE_VALIDATION_VIEWS and gain >= limit and is_significant, (
+    needed = limit if is_large else max(limit, MIN_GAIN_STANDARD_ERRORS * error)
+    return gain >= needed, (
         f"in {steps} steps gains and exposure map scored {gain:+.2f} dB of plain PSNR (standard error {error:.2f}) on "
-        f"{len(gains)} validation photos; the limit is {limit:+.2f} dB"
+        f"{len(gains)} validation photos; the limit is {needed:+.2f} dB"
     )
 
 

@@ -135,7 +135,7 @@ class ScenePilots:
         scene = dataclasses.replace(self.scene, train=training, test=[])
         budget, _ = budget_for(scene, TrainConfig(steps=BUDGET_REFERENCE_STEPS))
         scene = dataclasses.replace(scene, train=[reduce_view(view, reduction) for view in training])
-        return Fold(scene, validation, round(budget / reduction**2), step_cost(reduction))
+        return Fold(scene, validation, round(budget / reduction**2), pilot_step_cost(reduction))
 
     def run(
         self,
@@ -207,7 +207,7 @@ class ScenePilots:
         return score
 
 
-def step_cost(reduction: int) -> float:
+def pilot_step_cost(reduction: int) -> float:
     """Return the time of a training step on reduced photos, relative to a step on the photos themselves.
 
     Measured: .35 for a reduction of 2, with a quarter of the pixels and of the Gaussians.

@@ -1,8 +1,8 @@
 """Write the files of a finished run: the model, then scores, pictures, the training curve and `metrics.json`.
 
-The model is written first. All other results can be computed again from the model and the training record. The record
-is a small file beside the model, which is removed once all results are written. So after a full disk or an
-interruption, nothing has to be trained again.
+All results but the model can be computed again from the model and the training record. The record is a small file that
+is written before the model, and removed once all results are written. So after a full disk or an interruption, nothing
+has to be trained again.
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import statistics
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -101,10 +102,19 @@ def _is_usable(record: TrainingRecord) -> bool:
     """Return whether a record from a run's folder, which may be damaged or hostile, has what its results need."""
     if not isinstance(record.settings, dict) or not isinstance(record.metrics, dict):
         return False
-    if not isinstance(record.metrics.get("curve"), list):
+    curve = record.metrics.get("curve")
+    if not isinstance(curve, list) or not all(_is_curve_record(entry) for entry in curve):
         return False
     counts = (record.step, record.metrics.get("gaussians"), record.metrics.get("bytes"))
     return Path(record.model).name == record.model and all(type(count) is int for count in counts)
+
+
+def _is_curve_record(entry: object) -> bool:
+    """Return whether an entry of a training curve has finite numbers where one is drawn."""
+    if not isinstance(entry, dict):
+        return False
+    numbers = [entry.get(name) for name in ("step", "loss", "psnr", "gaussians")]
+    return all(type(number) in (int, float) and math.isfinite(cast(float, number)) for number in numbers)
 
 
 def changed_settings(record: TrainingRecord, scene: Scene, config: TrainConfig) -> list[str]:

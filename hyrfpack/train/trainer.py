@@ -35,7 +35,7 @@ from hyrfpack.render import RenderSettings
 from hyrfpack.render.renderer import pack_camera
 from hyrfpack.render.reserve import Reserve, can_reserve
 from hyrfpack.scene import Picture, Scene, View
-from hyrfpack.train.checkpoint import load_checkpoint, names_and_sizes, save_checkpoint
+from hyrfpack.train.checkpoint import damaged_checkpoint, load_checkpoint, names_and_sizes, save_checkpoint
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
 from hyrfpack.train.exposure import initialize_exposures
@@ -82,7 +82,8 @@ class Trainer:
 
     Attributes:
         steps: number of optimiser steps of the whole run.
-        learning_rates: those of `config`, adapted to the distance between Gaussians (`LearningRates.at_spacing`).
+        spacing: distance between the initial Gaussians in local units, see `gaussian_spacing`.
+        learning_rates: those of `config`, adapted to this spacing (`LearningRates.at_spacing`).
         kind: "pilot run" (`hyrfpack.train.pilots`), "first look" (`hyrfpack.make`), or empty for the run itself.
         replays_steps: whether a GPU replays captured steps (`hyrfpack.train.step_graphs`). If False, the host launches
             each step, as it does for several processes and for models that need more than kernels.
@@ -121,17 +122,24 @@ class Trainer:
         self.choices: dict[str, str] = {}  # For each setting, the choice and its reason.
         self.pilots: list[dict] = []  # The scores of the pilot runs, see `PilotScore`.
         self._warmup_steps = FIELD_WARMUP_STEPS if model is None else 0
+        usual_budget = usual_budget_for(scene, config.steps)
+
+        def build() -> tuple[HybridModel, int, dict[str, str], float]:
+            built, budget, choices = build_model(scene, config, self.cache)
+            return built, budget, choices, gaussian_spacing(built, scene.train, usual_budget)
+
         if model is None:
-            model, self.budget, self.choices = ranks.run_on_main(lambda: build_model(scene, config, self.cache))
+            model, self.budget, self.choices, self.spacing = ranks.run_on_main(build)
         else:
+            _check_trainable(model)
             self.budget = config.max_gaussians or len(model)
+            self.spacing = gaussian_spacing(model, scene.train, usual_budget)
         self._reserves, self._reserves_memory = ReserveEstimator(), can_reserve(device) and ranks.is_single
         self.replays_steps = self._reserves_memory and _can_capture(model)
         self._graphs = StepGraphs()
         self._packed_cameras: dict[tuple[str, RenderSettings, int], PackedCamera] = {}
-        self.exposures, self.choices["exposure"] = initialize_exposures(scene, config, self.cache, device)
-        spacing = gaussian_spacing(model, scene.train, usual_budget_for(scene, config.steps))
-        self.learning_rates = config.learning_rates.at_spacing(spacing)
+        self.exposures, self.choices["exposure"] = initialize_exposures(scene, config, self.cache, device, ranks)
+        self.learning_rates = config.learning_rates.at_spacing(self.spacing)
         self._take(model)
         self.strategy: Strategy = strategy or DensityControl(
             config.density, self.steps, self.budget, len(self.model), config.seed, device, ranks
@@ -310,7 +318,11 @@ class Trainer:
         except HyrfError as error:
             if error.__cause__ is not None and has_run_out_of_memory(error):
                 raise error.__cause__ from None
-            self._refuse(step, "a number to be rendered is not finite", self._nonfinite_parameters())
+            if broken := self._nonfinite_parameters():
+                self._refuse(step, "a number to be rendered is not finite", broken)
+            raise HyrfTrainingError(
+                f"training stopped at step {step} on view '{view.name}': {error.problem}", error.fix
+            ) from error
         for parameter, gradient in zip(self._learnt_parameters(), result.gradients, strict=True):
             parameter.grad = gradient
         for stage, seconds in result.seconds.items():
@@ -477,7 +489,7 @@ class Trainer:
         views = " or ".join(f"'{view.name}'" for view in self._views_of_step(step))
         raise HyrfTrainingError(
             f"training stopped at step {step} on view {views}: {what} (parameter groups: {where})",
-            fix="lower the learning rates or remove the view",
+            fix="remove or mask the photo, or train with another `seed`",
         )
 
     # -- state ---------------------------------------------------------------------------------------------------
@@ -515,9 +527,11 @@ class Trainer:
             HyrfError: the file cannot be written, or exists and `overwrite` is False.
         """
         observed = self.ranks.all_gather(_on_cpu(self.strategy.state_dict()))
-        if not self.ranks.is_main:
-            self.saved = self.step
-            return
+        self.ranks.run_on_main(lambda: self._write_checkpoint(path, observed, overwrite))
+        self.saved = self.step
+
+    def _write_checkpoint(self, path: Path, observed: list[dict[str, Tensor]], overwrite: bool) -> None:
+        """Write a checkpoint, given the density control observations of each rank."""
         tensors = self._tensors()
         for rank, values in enumerate(observed):
             tensors |= {f"{_strategy_prefix(rank)}{name}": value for name, value in values.items()}
@@ -529,9 +543,9 @@ class Trainer:
             "choices": self.choices,
             "resolution": self.resolution.changes,
             "pilots": self.pilots,
+            "spacing": self.spacing,
         }
         save_checkpoint(path, settings=self._settings(), tensors=tensors, progress=progress, overwrite=overwrite)
-        self.saved = self.step
 
     def load(self, path: Path) -> None:
         """Resume from the checkpoint at `path`, so that the result equals that of an uninterrupted run.
@@ -545,6 +559,15 @@ class Trainer:
             lambda: load_checkpoint(path, self._settings()) if self.ranks.is_main else ({}, {})
         )
         tensors, progress = self.ranks.broadcast(saved)
+        try:
+            self._resume(tensors, progress)
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            raise damaged_checkpoint(path) from error
+
+    def _resume(self, tensors: dict[str, Tensor], progress: dict) -> None:
+        """Restore the state of a checkpoint's tensors and progress."""
+        self.spacing = progress.get("spacing", self.spacing)  # Checkpoints of earlier versions do not have it.
+        self.learning_rates = self.config.learning_rates.at_spacing(self.spacing)
         self._restore(tensors)
         self._launched = None
         self.strategy.load_state_dict(_under(_strategy_prefix(self.ranks.rank), tensors))
@@ -556,11 +579,18 @@ class Trainer:
         self.pilots = progress.get("pilots", [])
 
 
+def _check_trainable(model: HybridModel) -> None:
+    """Check that the model has no residuals, which density control could not keep beside their Gaussians."""
+    if any(getattr(model.gaussians, name) is not None for name in Gaussians.RESIDUAL_NAMES):
+        raise HyrfTrainingError(
+            "the model has residuals, as imported models do, and only models without them can be trained",
+            fix="pass a model that `hyrfpack.train_model` made",
+        )
+
+
 def _can_capture(model: HybridModel) -> bool:
     """Return whether kernels compute a whole step. What replaces them may wait for the GPU or upload numbers."""
-    residuals = [getattr(model.gaussians, name) for name in Gaussians.RESIDUAL_NAMES]
-    has_kernels = replaced_operations().isdisjoint(GPU_OPERATIONS) and not model.config.position_gradients
-    return has_kernels and all(values is None for values in residuals)
+    return replaced_operations().isdisjoint(GPU_OPERATIONS) and not model.config.position_gradients
 
 
 def _on_cpu(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

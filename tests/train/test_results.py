@@ -238,6 +238,9 @@ def test_a_damaged_or_foreign_training_record_is_ignored(full_disk_suffixes, tmp
         train_model(make_scene(), tmp_path, SHORT_CONFIG, resume=True, context=QUIET_CONTEXT)
 
 
+CURVE_RECORD = {"step": 1, "loss": 0.1, "psnr": 20.5, "gaussians": 5}
+
+
 @pytest.mark.parametrize(
     "damage",
     [
@@ -247,6 +250,10 @@ def test_a_damaged_or_foreign_training_record_is_ignored(full_disk_suffixes, tmp
         {"metrics": {"gaussians": 5, "curve": []}},
         {"metrics": {"gaussians": 5, "bytes": 5}},
         {"metrics": {"gaussians": "5", "bytes": 5, "curve": []}},
+        {"metrics": {"gaussians": 5, "bytes": 5, "curve": [1]}},
+        {"metrics": {"gaussians": 5, "bytes": 5, "curve": [{"step": 1}]}},
+        {"metrics": {"gaussians": 5, "bytes": 5, "curve": [CURVE_RECORD | {"psnr": "20"}]}},
+        {"metrics": {"gaussians": 5, "bytes": 5, "curve": [CURVE_RECORD | {"loss": float("nan")}]}},
         {"step": "20"},
         {"model": "folder/model.hyrf"},
     ],
@@ -254,7 +261,7 @@ def test_a_damaged_or_foreign_training_record_is_ignored(full_disk_suffixes, tmp
 )
 def test_a_training_record_with_invalid_values_is_ignored(tmp_path, damage):
     (tmp_path / "model.hyrf").write_bytes(b"model")
-    facts = {"curve": [], "gaussians": 5, "bytes": 5}
+    facts = {"curve": [CURVE_RECORD], "gaussians": 5, "bytes": 5}
     record = TrainingRecord("model.hyrf", hashlib.sha256(b"model").hexdigest(), 20, {}, facts)
     (tmp_path / RECORD_FILE).write_bytes(dataclasses.replace(record, **damage).encode())
     assert read_record(tmp_path) == (None if damage else record)

@@ -10,12 +10,13 @@ import torch
 from scenes import ball_scene, view_of
 
 from hyrfpack.config.train import FIELD_WARMUP_STEPS
-from hyrfpack.errors import HyrfTrainingError
+from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.ops.adam import adam_step
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Picture, Scene
 from hyrfpack.train import DensityConfig, LearningRates, TrainConfig, Trainer
+from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
 from hyrfpack.train.density import spatial_order
 from hyrfpack.train.resolution import MIN_BACKGROUND_STRIDE
 
@@ -320,6 +321,36 @@ def test_resuming_again_and_again_gives_the_same_bytes(uninterrupted_trainer, tm
     assert parameter_bytes(last) == parameter_bytes(uninterrupted_trainer)
 
 
+def test_a_resumed_run_keeps_the_learning_rates_of_its_first_gaussians(tmp_path):
+    trainer = Trainer(make_scene(), SHORT_CONFIG)
+    trainer.spacing = 0.5  # as if the first Gaussians had been found in another way
+    trainer.save(tmp_path / "c.pt")
+    resumed = Trainer(make_scene(), SHORT_CONFIG)
+    resumed.load(tmp_path / "c.pt")
+    assert resumed.learning_rates == LearningRates().at_spacing(0.5)
+    assert resumed.optimizer.rates == resumed.learning_rates
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda tensors, progress: progress.clear(),
+        lambda tensors, progress: tensors.clear(),
+        lambda tensors, progress: progress.update(step=[1], resolution=3),
+        lambda tensors, progress: tensors.update({"model.gaussians.positions": torch.zeros(3, 2)}),
+        lambda tensors, progress: tensors.update({"model.geometry.grid.table": None}),
+    ],
+)
+def test_a_checkpoint_with_missing_or_wrong_values_is_a_clear_error(damage, tmp_path):
+    path, trainer = tmp_path / "c.pt", Trainer(make_scene(), SHORT_CONFIG)
+    trainer.save(path)
+    tensors, progress = load_checkpoint(path, trainer._settings())
+    damage(tensors, progress)
+    save_checkpoint(path, settings=trainer._settings(), tensors=tensors, progress=progress)
+    with pytest.raises(HyrfTrainingError, match="the checkpoint is damaged"):
+        Trainer(make_scene(), SHORT_CONFIG).load(path)
+
+
 def test_random_backgrounds_resume_too(tmp_path):
     config = dataclasses.replace(SHORT_CONFIG, steps=16, background_color="random")
     expected = train_trainer(config, alpha=True)
@@ -406,6 +437,22 @@ def test_a_parameter_that_is_not_finite_stops_the_run_and_is_named(name):
     message = str(caught.value)
     assert "step 1 " in message and f"'{first}'" in message
     assert name in message
+
+
+def test_a_view_that_cannot_be_rendered_is_named_with_the_reason_and_its_fix(monkeypatch):
+    trainer = Trainer(make_scene(), SHORT_CONFIG)
+
+    def fail(*_):
+        raise HyrfError("the view's pose: a number is infinite", fix="correct the pose")
+
+    monkeypatch.setattr(trainer, "_compute", fail)
+    first = next(trainer._order()).name
+    with pytest.raises(HyrfTrainingError) as caught:
+        trainer.run()
+    assert (
+        caught.value.problem == f"training stopped at step 1 on view '{first}': the view's pose: a number is infinite"
+    )
+    assert caught.value.fix == "correct the pose"
 
 
 def test_a_gradient_that_is_not_finite_stops_the_run_before_it_spreads():
@@ -596,6 +643,14 @@ def test_a_loaded_model_can_be_trained_further():
     trainer = Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, steps=1), model=model)
     trainer.run()
     assert not torch.equal(trainer.model.gaussians.color_logits, before)
+
+
+@pytest.mark.parametrize("name", ["shape_residuals", "color_residuals"])
+def test_a_model_with_residuals_is_not_trained(name):
+    model = Trainer(make_scene(), SHORT_CONFIG).model
+    setattr(model.gaussians, name, torch.zeros(len(model), 5))
+    with pytest.raises(HyrfTrainingError, match="has residuals"):
+        Trainer(make_scene(), SHORT_CONFIG, model=model)
 
 
 def test_pixel_sizes_of_a_loaded_model_do_not_affect_its_training():
