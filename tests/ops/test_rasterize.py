@@ -8,7 +8,9 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from layers import only_in_acceptance
@@ -16,7 +18,7 @@ from ops.device import IS_INTERPRETED, KERNEL_DEVICE, gpu, needs_triton, pair_wi
 from torch import Tensor
 
 from hyrfpack.ops.dispatch import has_triton
-from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, RasterSettings, rasterize
+from hyrfpack.ops.rasterize import Gaussians3D, Rasterization, RasterSettings, cpu_bin, rasterize
 from hyrfpack.ops.rasterize.reference import blend, project
 from hyrfpack.ops.viewport import Viewport
 
@@ -505,6 +507,22 @@ def test_tile_counts_that_disagree_with_the_list_change_nothing_else(
         assert torch.equal(picture.rgb, expected.rgb)
         assert all(torch.equal(grads[name], expected_grads[name]) for name in PARAMETER_NAMES)
     assert all(torch.isfinite(grads[name]).all() for name in PARAMETER_NAMES)
+
+
+def test_a_cpu_stops_looking_for_pairs_when_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched = []
+
+    def find_pairs(start: int, stop: int, *arguments: Any) -> tuple[np.ndarray, np.ndarray]:
+        searched.append(stop - start)
+        return original(start, stop, *arguments)
+
+    original = cpu_bin.find_pairs
+    monkeypatch.setattr(cpu_bin, "find_pairs", find_pairs)
+    monkeypatch.setattr(cpu_bin, "MAX_PAIRS", 3)
+    monkeypatch.setenv("HYRFPACK_THREADS", "1")
+    with pytest.raises(MemoryError, match="pairs"):
+        _picture(Case(_gaussians(2048)), "cpu")
+    assert sum(searched) < 2048
 
 
 @needs_triton

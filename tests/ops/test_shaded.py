@@ -134,3 +134,14 @@ def test_colors_that_are_not_finite_are_named_where_they_are_drawn() -> None:
     splats, colors = gaussians(20), shading(20)
     colors.first_layer[3] = float("nan")
     assert draw_on_gpu(splats, colors, camera()).nonfinite == ("colors",)
+
+
+@pytest.mark.parametrize(
+    "argument",
+    [{"absgrad": torch.zeros(8, 2)}, {"used": torch.tensor(8)}, {"reserve": 5}],
+    ids=lambda value: next(iter(value)),
+)
+def test_arguments_of_training_are_rejected(argument: dict) -> None:
+    viewport = Viewport(camera(), CAMERA_INTRINSICS, 24, 20)
+    with pytest.raises(ValueError, match="not a Shading"):
+        rasterize(Gaussians3D(*gaussians(8)), shading(8), viewport, **argument)

@@ -70,7 +70,7 @@ def mlp(
     if used is not None:
         x = clear_unused_rows(x, used)
     if chosen == "cpu":
-        y = _CpuMlp.apply(x, *weights, *biases)
+        y = _CpuMlp.apply(x, torch.is_grad_enabled(), *weights, *biases)
     else:
         y = reference.mlp(x, weights, biases, mixed)
     return y if used is None else clear_unused_rows(y, used)
@@ -86,11 +86,12 @@ class _CpuMlp(torch.autograd.Function):
     """Autograd function of `mlp` on the CPU."""
 
     @staticmethod
-    def forward(ctx, x: Tensor, *parameters: Tensor) -> Tensor:
+    def forward(ctx, x: Tensor, has_gradients: bool, *parameters: Tensor) -> Tensor:
         from hyrfpack.ops.mlp import cpu
 
         weights, biases = _halves(parameters)
-        hidden = cpu.allocate_hidden(len(x), weights) if any(ctx.needs_input_grad) else []
+        # needs_input_grad is True for parameters even where no gradients are recorded.
+        hidden = cpu.allocate_hidden(len(x), weights) if has_gradients and any(ctx.needs_input_grad) else []
         ctx.save_for_backward(x, *parameters)
         ctx.hidden = hidden
         return cpu.forward(x, weights, biases, hidden)
@@ -103,7 +104,7 @@ class _CpuMlp(torch.autograd.Function):
         x, *parameters = ctx.saved_tensors
         needs_x = ctx.needs_input_grad[0]
         grad_x, grad_weights, grad_biases = cpu.backward(x, *_halves(parameters), ctx.hidden, grad, needs_x)
-        return grad_x, *grad_weights, *grad_biases
+        return grad_x, None, *grad_weights, *grad_biases
 
 
 class _GpuMlp(torch.autograd.Function):

@@ -90,7 +90,8 @@ def rasterize(
     Raises:
         FloatingPointError: with a `Shading`, a centre is NaN or infinite ("reference"; "gpu" reports it as
             `nonfinite`).
-        ValueError: shapes, dtypes or devices do not match, or pairs are reserved for another implementation than "gpu".
+        ValueError: shapes, dtypes or devices do not match; pairs are reserved for another implementation than "gpu"; or
+            `absgrad`, `used` or `reserve` is given with a `Shading`.
         MemoryError: there are more (Gaussian, tile) pairs than "cpu" (2^28) or "gpu" (2^31) can index.
 
     Example:
@@ -103,6 +104,8 @@ def rasterize(
     if isinstance(colors, Shading):
         from hyrfpack.ops.rasterize.shaded import rasterize_shaded
 
+        if any(value is not None for value in (absgrad, used, reserve)):
+            raise ValueError("absgrad, used and reserve need colours, not a Shading")
         return rasterize_shaded(gaussians, colors, viewport, settings, implementation)
     check_shapes(gaussians, colors)
     count, dtype = len(gaussians.means), gaussians.means.dtype

@@ -203,21 +203,24 @@ def _bin_pairs(order: np.ndarray, projection: Projection, view: _View) -> _Tiles
     slot_starts = np.zeros(len(records) + 1, np.int64)
     sorted_records = _cache_line_rows(count)
     chunk_pairs: list = [None] * chunks
+    pair_count = 0
 
     def find(chunk: int) -> None:
+        nonlocal pair_count
+        if pair_count >= cpu_bin.MAX_PAIRS:  # Further pairs would only take memory.
+            raise _too_many_pairs()
         chunk_pairs[chunk] = cpu_bin.find_pairs(
             edges[chunk], edges[chunk + 1], order, projection.tile_count_bounds, records, width, height,
             tile_counts[chunk], slot_starts[1:], sorted_records,
         )  # fmt: skip
+        pair_count += len(chunk_pairs[chunk][0])
 
     run_tasks(find, chunks)
     np.cumsum(slot_starts, out=slot_starts)
     starts = np.empty(tile_total + 1, np.int64)
     cpu_bin.assign_chunk_offsets(tile_counts, starts)
     if slot_starts[-1] >= cpu_bin.MAX_PAIRS:
-        raise MemoryError(
-            f"{slot_starts[-1]} pairs of a Gaussian and a tile; at most {cpu_bin.MAX_PAIRS - 1} can be drawn"
-        )
+        raise _too_many_pairs()
     pairs = np.empty(slot_starts[-1], np.uint64)
 
     def fill(chunk: int) -> None:
@@ -227,6 +230,10 @@ def _bin_pairs(order: np.ndarray, projection: Projection, view: _View) -> _Tiles
 
     run_tasks(fill, chunks)
     return _Tiles(sorted_records, slot_starts, starts, pairs)
+
+
+def _too_many_pairs() -> MemoryError:
+    return MemoryError(f"a view has {cpu_bin.MAX_PAIRS:,} pairs of a Gaussian and a tile or more")
 
 
 def _tile_runs(starts: np.ndarray) -> list[tuple[int, int]]:

@@ -120,6 +120,7 @@ def find_pairs(start, stop, order, tile_count_bounds, records, width, height, ti
     capacity = 0
     for position in range(np.uint64(start), np.uint64(stop)):
         capacity += np.int64(tile_count_bounds[order[position]])
+    capacity = min(capacity, MAX_PAIRS)  # With so many pairs, the view is not drawn.
     tiles, rows = np.empty(capacity, np.uint32), np.empty(capacity, np.uint8)
     tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE
     at = 0
