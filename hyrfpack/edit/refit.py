@@ -96,7 +96,7 @@ def refit(
             settings = replace(resolution.render_settings(view.camera, step + 1), exposure=AS_PHOTOGRAPHED)
             image = render_view(trained, view.camera, settings).rgb
             if view.name in gains:
-                image = apply_exposure_gains(image, gains[view.name])
+                image = apply_exposure_gains(image.clamp(0, 1), gains[view.name])
             loss = photometric_loss(image, target, mask)
             if not loss.isfinite():
                 raise HyrfError(f"{view.name}: the loss is not finite", fix="leave out this photo")

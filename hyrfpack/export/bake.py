@@ -296,7 +296,7 @@ def _centered_colors(
     colors = logits.add_(shading.color_logits[index]).sigmoid_()
     if residuals is not None:
         colors = add_color_residuals(colors, residuals[index], directions)
-    return (colors if gains is None else apply_exposure_gains(colors, gains)).sub_(0.5)
+    return (colors if gains is None else apply_exposure_gains(colors.clamp(0, 1), gains)).sub_(0.5)
 
 
 def check_finite(name: str, values: Tensor) -> None:

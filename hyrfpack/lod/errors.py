@@ -14,11 +14,12 @@ from hyrfpack.cameras.view_sampling import resize_camera
 from hyrfpack.format.scene_model import join_parts
 from hyrfpack.lod.select import project_sphere
 from hyrfpack.model import Decoded, HybridModel
-from hyrfpack.model.merged import MergedModel, scene_of
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.render.parts import camera_frame, gather_geometry
+from hyrfpack.render.renderer import raster_settings_of
 from hyrfpack.scene import Camera
 
 ERROR_RADII = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0)
@@ -124,13 +125,13 @@ class _Pool:
         index = torch.from_numpy(np.flatnonzero(self.level_of == 0))
         none = np.zeros(len(sets[0]), bool)
         members = np.stack([each[self.chunk_of[index]] for each in (*sets, none, none)[:_COLUMNS]], axis=1)
-        model, config = self.model, scene_of(self.model).config
+        model = self.model
         if isinstance(model, MergedModel):
             gaussians, frame = gather_geometry(model, camera, index, self.decoded), camera_frame(model, camera)
         else:
-            gaussians, frame = self.decoded[index].geometry.at(model.gaussians.positions[index]), config.frame
+            gaussians, frame = self.decoded[index].geometry.at(model.gaussians.positions[index]), model.config.frame
         viewport = frame.local_viewport(camera, gaussians.means.dtype)
-        settings = RenderSettings().raster_settings(config.antialiased)
+        settings = raster_settings_of(model, RenderSettings())
         return rasterize(gaussians, torch.from_numpy(members).to(gaussians.means), viewport, settings).rgb
 
 

@@ -67,7 +67,7 @@ class Frame:
             HyrfDataError: a corner is not finite, or the box has size 0.
         """
         low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
-        half = (high - low) / 2
+        half = high / 2 - low / 2
         scale = float(half.max())
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
             raise HyrfDataError("the scene's box is not finite", fix="check the poses and points for NaN or infinity")
@@ -77,7 +77,7 @@ class Frame:
                 fix="give views from different places",
             )
         half = np.maximum(half / scale, MIN_HALF_EXTENT)
-        (x, y, z), (a, b, c) = ((low + high) / 2).tolist(), half.tolist()
+        (x, y, z), (a, b, c) = (low / 2 + high / 2).tolist(), half.tolist()
         return cls((x, y, z), scale, (a, b, c))
 
     def to_local(self, points: np.ndarray) -> np.ndarray:

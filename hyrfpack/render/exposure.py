@@ -16,7 +16,8 @@ def apply_exposure_map(model: HybridModel, camera: Camera, rgb: Tensor) -> Tenso
     Args:
         model: the model that was rendered.
         camera: the camera that it was rendered from, in world units.
-        rgb: (..., 3) in [0, 1], rendered with `RenderSettings(exposure="consistent")`.
+        rgb: (..., 3) rendered with `RenderSettings(exposure="consistent")`. Colours above 1, which colour residuals can
+            cause, become 1, because the gains are not defined there.
 
     Returns:
         (..., 3) in [0, 1]; `rgb` itself if the model has no exposure map. Differentiable in `rgb`.
@@ -24,4 +25,4 @@ def apply_exposure_map(model: HybridModel, camera: Camera, rgb: Tensor) -> Tenso
     if model.exposure is None:
         return rgb
     gains = model.exposure.predict_gains(model.config.frame.local_pose(camera))
-    return apply_exposure_gains(rgb, tensor_like(gains.tolist(), rgb))
+    return apply_exposure_gains(rgb.clamp(0, 1), tensor_like(gains.tolist(), rgb))

@@ -17,11 +17,11 @@ from hyrfpack.config.render import GeometryConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
-from hyrfpack.model.merged import MergedModel, scene_of
+from hyrfpack.model.merged import MergedModel
 from hyrfpack.outputs import PICTURE_SUFFIXES
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.render.geometry_files import GeometryWriter
-from hyrfpack.render.renderer import RenderedPicture, RenderSettings, render_view
+from hyrfpack.render.renderer import RenderedPicture, RenderSettings, raster_settings_of, render_view
 from hyrfpack.render.surface import drawn_gaussians, render_surface
 from hyrfpack.scene import Camera
 
@@ -48,7 +48,7 @@ def render_files(
             `<name>.normals.<extension>`, see `hyrfpack.render.geometry_files`.
         settings: render settings.
         overwrite: replace existing files. Without it, an image whose file exists is written under a free file name in
-            the same folder, and an existing file of geometry is an error.
+            the same folder, with its geometry beside it. An existing file of geometry is then an error.
         ranks: processes that share the cameras; each yields the paths that it has written.
 
     Raises:
@@ -73,14 +73,14 @@ def make_renderer(
     """Decode a model once, and return a function that renders it with the geometry that is wanted."""
     with torch.no_grad():
         decoded = model.decode()
-    antialiased = scene_of(model).config.antialiased
+    raster_settings = raster_settings_of(model, settings)
 
     def draw(camera: Camera) -> RenderedPicture:
         rendering = render_view(model, camera, settings, decoded=decoded)
         if not geometry.is_wanted:
             return RenderedPicture(rendering.rgb)
         gaussians, frame = drawn_gaussians(model, camera, decoded, rendering.indices[rendering.visible])
-        surface = render_surface(gaussians, frame, camera, settings, antialiased, normals=geometry.normals is not None)
+        surface = render_surface(gaussians, frame, camera, raster_settings, normals=geometry.normals is not None)
         return RenderedPicture(rendering.rgb, *surface)
 
     return draw
@@ -106,7 +106,7 @@ def write_pictures(
         path = Path(folder) / f"{name}.png"
         written = save_picture(path, to_image(rendering.rgb), overwrite=overwrite)
         if geometry is not None:
-            geometry.write(path, rendering, overwrite=overwrite)
+            geometry.write(written, rendering, overwrite=overwrite)
         yield written
 
 
@@ -117,12 +117,17 @@ def render_file_names(
     """Return the names of the files that `render_files` writes for cameras of these names, relative to its folder.
 
     Raises:
-        HyrfError: two files would have the same name, as the depth of "a" and the picture of "a.depth".
+        HyrfError: two files would have the same name, as the depth of "a" and the picture of "a.depth", or differ in
+            case only; or a file would have the name of a folder.
     """
     files = [f"{name}{ending}" for name in unique_stems(names) for ending in (".png", *geometry.endings)]
-    name, count = Counter(files).most_common(1)[0] if files else ("", 0)
-    if count > 1:
-        raise HyrfError(f"{name}: two of the files to be written would have this name", fix="rename a camera")
+    counts = Counter(name.casefold() for name in files)
+    folders = {str(folder) for name in counts for folder in PurePosixPath(name).parents}
+    for name in files:
+        if counts[name.casefold()] > 1:
+            raise HyrfError(f"{name}: two of the files to be written would have this name", fix="rename a camera")
+        if name.casefold() in folders:
+            raise HyrfError(f"{name}: a file and a folder to be written would have this name", fix="rename a camera")
     return files
 
 

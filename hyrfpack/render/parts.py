@@ -103,7 +103,7 @@ def expose_parts(
     Args:
         model: the merged model.
         camera: the camera, in world units.
-        rgb: (H, W, 3) in [0, 1], at the consistent exposure of each part.
+        rgb: (H, W, 3), at the consistent exposure of each part. Colours above 1 become 1, as in `apply_exposure_map`.
         index, gaussians: results of `gather_parts`.
         viewport: the camera, in the local units of `camera_frame`.
         settings: settings that `rgb` was rasterised with.
@@ -117,7 +117,7 @@ def expose_parts(
     ends = torch.tensor([len(part) for part in model.parts], device=index.device).cumsum(0)
     blended = rasterize(gaussians, log_gains[torch.bucketize(index, ends, right=True)], viewport, settings)
     behind = blended.transmittance[..., None] * log_gains[0]
-    return apply_exposure_gains(rgb, (blended.rgb + behind).exp())
+    return apply_exposure_gains(rgb.clamp(0, 1), (blended.rgb + behind).exp())
 
 
 def _predict_log_gains(model: HybridModel, camera: Camera) -> list[float]:

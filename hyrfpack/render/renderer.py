@@ -8,6 +8,7 @@ from math import inf
 import torch
 from torch import Tensor
 
+from hyrfpack.cameras.sampling import MAX_BACKGROUND_STRIDE
 from hyrfpack.checks import check_choice, check_float, check_int, check_type
 from hyrfpack.choices import AS_PHOTOGRAPHED, RENDER_EXPOSURES
 from hyrfpack.errors import HyrfError
@@ -45,7 +46,8 @@ class RenderSettings:
             keeps every Gaussian in front of the camera.
         background_threshold: pixels with at most this transmittance get no background (tau in the paper).
         background_stride: the background is evaluated at every background_stride-th pixel of each axis and
-            interpolated between them; 1 evaluates every pixel. None has the spacing of training, at any size of view.
+            interpolated between them; 1 evaluates every pixel, and 64 is the largest. None has the spacing of training,
+            at any size of view.
         transmittance_min: blending of a pixel stops when its transmittance is at most this; 0 blends every Gaussian.
         exposure: "as-photographed" applies the model's exposure map, so that a view looks like the photos taken near
             it; "consistent" renders all views at the model's own exposure. Without a map, both are the same.
@@ -67,7 +69,7 @@ class RenderSettings:
         check_float("low_pass_variance", self.low_pass_variance, MIN_LOW_PASS_VARIANCE)
         check_float("cull_tolerance", self.cull_tolerance, maximum=inf)
         if self.background_stride is not None:
-            check_int("background_stride", self.background_stride, 1)
+            check_int("background_stride", self.background_stride, 1, MAX_BACKGROUND_STRIDE)
         check_choice("exposure", self.exposure, RENDER_EXPOSURES)
         check_float("transmittance_min", self.transmittance_min, 0, 1)
         if self.transmittance_min == 1:
@@ -85,12 +87,13 @@ class Rendering:
     """A rendered view.
 
     Attributes:
-        rgb: (H, W, 3) display-referred colour, background included; within [0, 1] up to rounding.
+        rgb: (H, W, 3) display-referred colour, background included; within [0, 1] up to rounding, and above 1 only in
+            models with colour residuals.
         alpha: (H, W) coverage by Gaussians, 1 - transmittance.
         depth: (H, W) expected depth along the view axis in world units, 0 where no Gaussian is hit; None unless
             requested.
-        indices: (n,) indices of the Gaussians that were decoded: those in view, or all if `decoded` has a shading
-            but no colours, and the model has no colour residuals.
+        indices: (n,) indices of the Gaussians that were decoded: those in view, or on a GPU all if `decoded` has a
+            shading but no colours, and the model has no colour residuals.
         visible: (n,) bool, whether each of these touches the image.
         absgrad: (n, 2) sums over pixels of |dL/d mean2d| in 1/px; zero until backward has run; None unless requested.
         pairs: number of blended tile-Gaussian pairs, or of those reserved.
@@ -200,9 +203,7 @@ def render_view(
             if (sizes := model.gaussians.pixel_sizes) is not None:
                 gaussians = widen_to_photos(gaussians, sizes[index], viewport, antialiased=model.config.antialiased)
         gradients = positions.new_zeros(len(index), 2) if absgrad else None
-        raster_settings = settings.raster_settings(scene.config.antialiased, depth)
-        if isinstance(model, MergedModel):
-            raster_settings = replace(raster_settings, near=nearest_plane(model, settings.near))
+        raster_settings = raster_settings_of(model, settings, depth)
         raster = rasterize(
             gaussians, colors, raster_viewport, raster_settings,
             absgrad=gradients, used=used, reserve=reserve.pairs if reserve else None,
@@ -244,6 +245,16 @@ def render_view(
     )
 
 
+def raster_settings_of(
+    model: HybridModel | MergedModel, settings: RenderSettings, depth: bool = False
+) -> RasterSettings:
+    """Return the settings with which `render_view` rasterises a model in the local units of its frame."""
+    raster_settings = settings.raster_settings(scene_of(model).config.antialiased, depth)
+    if isinstance(model, MergedModel):
+        raster_settings = replace(raster_settings, near=nearest_plane(model, settings.near))
+    return raster_settings
+
+
 def pack_camera(model: HybridModel, camera: Camera, settings: RenderSettings) -> PackedCamera:
     """Upload the numbers of a camera that GPU kernels read, for a model on a GPU.
 
@@ -278,8 +289,8 @@ def _select_gaussians(
     With a reserve, also the number of indices in use and what the reserve must have, as `frustum_cull_into` returns
     them; otherwise None, None.
 
-    With precomputed shading and without colours or colour residuals, `rasterize` gets all Gaussians and culls them
-    itself. Otherwise only those in view are shaded.
+    On a GPU, with precomputed shading and without colours or colour residuals, `rasterize` gets all Gaussians and culls
+    them itself. Otherwise only those in view are shaded.
 
     Raises:
         FloatingPointError: a position is NaN or infinite.
@@ -287,7 +298,8 @@ def _select_gaussians(
     positions = model.gaussians.positions
     shading, known_colors = (None, None) if decoded is None else (decoded.shading, decoded.colors)
     has_residuals = model.gaussians.color_residuals is not None
-    if decoded is not None and shading is not None and known_colors is None and not has_residuals:
+    is_shaded_by_kernel = positions.is_cuda and known_colors is None and not has_residuals
+    if decoded is not None and shading is not None and is_shaded_by_kernel:
         return torch.arange(len(model), device=positions.device), decoded.geometry.at(positions), shading, None, None
     used, demand = None, None
     with add_seconds(seconds, "cull"), torch.no_grad():
@@ -324,7 +336,8 @@ def _check_finite(**values: Tensor) -> None:
 
 def _nonfinite_error(name: str) -> HyrfError:
     """Return the error for numbers of a view that are not finite."""
+    name = "positions" if name == "means" else name
     return HyrfError(
-        f"the view's {name} hold NaN or infinity, from a broken model or a pose beyond float32",
-        fix="train the model again or correct the pose",
+        f"the view's {name}: a number is NaN or infinite, in a broken model or a pose beyond float32",
+        fix="correct the pose" if name == "pose" else "train the model again or correct the pose",
     )

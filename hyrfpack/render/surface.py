@@ -6,14 +6,14 @@ import torch
 from torch import Tensor
 
 from hyrfpack.model import Decoded, Frame, HybridModel
-from hyrfpack.model.merged import MergedModel, scene_of
-from hyrfpack.ops.rasterize import Gaussians3D, rasterize
+from hyrfpack.model.merged import MergedModel
+from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
 from hyrfpack.ops.rasterize.median_depth import median_depth
 from hyrfpack.ops.rasterize.reference import quats_to_rotations
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render.depth_normals import normals_from_depth, unit_rays
 from hyrfpack.render.parts import camera_frame, gather_geometry
-from hyrfpack.render.renderer import RenderSettings
+from hyrfpack.render.renderer import RenderSettings, raster_settings_of
 from hyrfpack.render.sampling import widen_to_photos
 from hyrfpack.scene import Camera
 
@@ -39,7 +39,7 @@ def render_median_depth(
         settings: render settings.
     """
     gaussians, frame = drawn_gaussians(model, camera, decoded, index)
-    return _median_depth_in_frame(gaussians, frame, camera, settings, scene_of(model).config.antialiased)
+    return _median_depth_in_frame(gaussians, frame, camera, raster_settings_of(model, settings))
 
 
 def drawn_gaussians(
@@ -58,22 +58,23 @@ def drawn_gaussians(
 @torch_on_one_thread()
 @torch.no_grad()
 def render_surface(
-    gaussians: Gaussians3D, frame: Frame, camera: Camera, settings: RenderSettings, antialiased: bool, *, normals: bool
+    gaussians: Gaussians3D, frame: Frame, camera: Camera, settings: RasterSettings, *, normals: bool
 ) -> tuple[Tensor, Tensor | None]:
     """Render the median depth (H, W) and, if wanted, the normals (H, W, 3) of Gaussians in the local units of a frame.
 
     Both are on the CPU and in world units and axes; see `render_median_depth` and `render_normals`.
+
+    Args:
+        settings: those with which the Gaussians are rasterised.
     """
-    depth = _median_depth_in_frame(gaussians, frame, camera, settings, antialiased)
-    return depth, render_normals(gaussians, depth, frame, camera, settings, antialiased) if normals else None
+    depth = _median_depth_in_frame(gaussians, frame, camera, settings)
+    return depth, render_normals(gaussians, depth, frame, camera, settings) if normals else None
 
 
-def _median_depth_in_frame(
-    gaussians: Gaussians3D, frame: Frame, camera: Camera, settings: RenderSettings, antialiased: bool
-) -> Tensor:
+def _median_depth_in_frame(gaussians: Gaussians3D, frame: Frame, camera: Camera, settings: RasterSettings) -> Tensor:
     on_cpu = Gaussians3D(*(tensor.detach().cpu() for tensor in gaussians))
     viewport = frame.local_viewport(camera, on_cpu.means.dtype)
-    return frame.scale * median_depth(on_cpu, viewport, settings.raster_settings(antialiased))
+    return frame.scale * median_depth(on_cpu, viewport, settings)
 
 
 @torch_on_one_thread()
@@ -83,8 +84,7 @@ def render_normals(
     depth: Tensor,
     frame: Frame,
     camera: Camera,
-    settings: RenderSettings,
-    antialiased: bool,
+    settings: RasterSettings,
     *,
     depth_weight: float = DEPTH_NORMAL_WEIGHT,
 ) -> Tensor:
@@ -99,8 +99,7 @@ def render_normals(
         depth: (H, W) median depth in world units, 0 where there is no surface.
         frame: the frame.
         camera: the camera, in world units.
-        settings: render settings.
-        antialiased: whether Gaussians are dimmed that the low-pass filter widens.
+        settings: those with which the Gaussians are rasterised.
         depth_weight: weight of the normals from depth.
     """
     viewport = frame.local_viewport(camera, gaussians.means.dtype)
@@ -112,7 +111,7 @@ def render_normals(
     faces_away = (shortest * positions).sum(dim=-1, keepdim=True) > 0
     flatness = 1 - scales[:, :1] / scales[:, 1:2].clamp_min(torch.finfo(scales.dtype).tiny)
     weighted = torch.where(faces_away, -shortest, shortest) * flatness.square()
-    blended = rasterize(gaussians, weighted, viewport, settings.raster_settings(antialiased)).rgb.cpu().double()
+    blended = rasterize(gaussians, weighted, viewport, settings).rgb.cpu().double()
     depth = depth.cpu().double()
     normals = blended + depth_weight * normals_from_depth(depth, camera)
     faces_away = (normals * unit_rays(camera)).sum(dim=-1, keepdim=True) > 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -57,18 +58,22 @@ def write_video(
         "mp4",
     ]
     with pending_file(path, overwrite=overwrite) as pending:
-        with subprocess.Popen(
-            [*command, str(pending.temporary)], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
-        ) as process:  # the context waits for the program, also if a frame cannot be read
-            assert process.stdin is not None  # because stdin is a pipe
-            try:
-                for frame in frames:
-                    process.stdin.write(frame.read_bytes())
-            except BrokenPipeError:  # ffmpeg has stopped; its message, read below, gives the reason
-                pass
-            _, complaint = process.communicate()
+        # Messages go to a file, because a pipe that nobody reads would block ffmpeg once it is full.
+        with tempfile.TemporaryFile() as messages:
+            with subprocess.Popen(
+                [*command, str(pending.temporary)], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=messages
+            ) as process:  # the context waits for the program, also if a frame cannot be read
+                assert process.stdin is not None  # because stdin is a pipe
+                try:
+                    for frame in frames:
+                        process.stdin.write(frame.read_bytes())
+                except BrokenPipeError:  # ffmpeg has stopped; its message, read below, gives the reason
+                    pass
+                process.communicate()
+            messages.seek(0)
+            message = messages.read().decode(errors="replace")
         if process.returncode:
-            lines = complaint.decode(errors="replace").strip().splitlines() or ["it gave no reason"]
+            lines = message.strip().splitlines() or ["it gave no reason"]
             raise HyrfError(
                 f"{path}: ffmpeg could not make the video ({lines[-1]})",
                 fix="use the pictures, which are written",

@@ -123,7 +123,7 @@ def draw_picture(
     rgb = draw(drawable, camera, settings).rgb
     if not geometry.is_wanted:
         return RenderedPicture(rgb)
-    frame, antialiased = drawable.frame, drawable.antialiased
+    frame, raster_settings = drawable.frame, settings.raster_settings(drawable.antialiased)
     index = frustum_cull(drawable.positions, frame.local_viewport(camera), settings.near, settings.cull_tolerance)
     seen, has_normals = drawable.gaussians.select(index), geometry.normals is not None
-    return RenderedPicture(rgb, *render_surface(seen, frame, camera, settings, antialiased, normals=has_normals))
+    return RenderedPicture(rgb, *render_surface(seen, frame, camera, raster_settings, normals=has_normals))

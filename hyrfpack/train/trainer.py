@@ -54,7 +54,7 @@ from hyrfpack.version import __version__
 
 _LOG = logging.getLogger(__name__)
 
-OUT_OF_MEMORY_FIX = "reduce `max_gaussians` or `max_size`, or use `device='cpu'`"
+OUT_OF_MEMORY_FIX = "reduce `max_gaussians` or `max_size`"
 MIN_CURVE_RECORDS = 200  # A run of more steps has up to twice as many records.
 
 
@@ -321,7 +321,7 @@ class Trainer:
             if broken := self._nonfinite_parameters():
                 self._refuse(step, "a number to be rendered is not finite", broken)
             raise HyrfTrainingError(
-                f"training stopped at step {step} on view '{view.name}': {error.problem}", error.fix
+                f"training stopped at step {step} on view '{view.name}': {error.problem}", fix=error.fix
             ) from error
         for parameter, gradient in zip(self._learnt_parameters(), result.gradients, strict=True):
             parameter.grad = gradient

@@ -12,6 +12,7 @@ from scenes import ball_points, ball_scene, small_model
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.model.exposure import MAX_CENTERS, ExposureMap, apply_exposure_gains
+from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.render import RenderSettings, render_view
 
 RANDOM_SEEDS = st.integers(0, 2**32 - 1)
@@ -111,6 +112,23 @@ def test_render_applies_the_map_unless_one_exposure_is_requested():
     torch.testing.assert_close(
         render_view(model, camera, RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb, plain, rtol=0, atol=0
     )
+
+
+def test_colours_above_one_are_white_at_any_exposure():
+    model, camera = small_model(ball_points(50)[0], opacity_logits=4.0), ball_scene().train[0].camera
+    residuals = torch.zeros(len(model), 3)
+    residuals[:] = 10.0
+    gaussians = model.gaussians
+    parameters = {name: getattr(gaussians, name) for name in Gaussians.PARAMETER_NAMES}
+    config = dataclasses.replace(model.config, residual_degree=0)
+    bright = model.with_gaussians(
+        Gaussians(**parameters, shape_residuals=torch.zeros(len(model), 5), color_residuals=residuals), config
+    )
+    plain = render_view(bright, camera).rgb
+    bright.exposure = constant_map([-1.0, -1.0, -1.0])
+    exposed = render_view(bright, camera).rgb
+    assert plain.max() > 2 and (plain >= 1).float().mean() > 0.01
+    assert bool((exposed[plain >= 1] == 1).all()) and bool(((exposed >= 0) & (exposed <= 1)).all())
 
 
 def test_render_differentiates_through_the_map():

@@ -92,6 +92,16 @@ def test_an_error_of_ffmpeg_is_quoted_and_keeps_the_old_video(tmp_path, monkeypa
 
 @pytest.mark.integration
 @pytest.mark.skipif(os.name == "nt", reason="needs executable scripts")
+def test_many_messages_of_ffmpeg_do_not_block_the_video(tmp_path, monkeypatch):
+    body = "sys.stderr.write('message\\n' * 100_000)\nopen(sys.argv[-1], 'wb').write(sys.stdin.buffer.read())"
+    install_fake_ffmpeg(tmp_path, monkeypatch, body)
+    (tmp_path / "frame.png").write_bytes(b"frame" * 100_000)
+    write_video([tmp_path / "frame.png"], tmp_path / "video.mp4")
+    assert (tmp_path / "video.mp4").read_bytes() == b"frame" * 100_000
+
+
+@pytest.mark.integration
+@pytest.mark.skipif(os.name == "nt", reason="needs executable scripts")
 def test_without_overwrite_a_video_that_appears_meanwhile_is_kept(tmp_path, monkeypatch):
     video = tmp_path / "video.mp4"
     body = f"open({str(video)!r}, 'wb').write(b'foreign')\nopen(sys.argv[-1], 'wb').write(sys.stdin.buffer.read())"

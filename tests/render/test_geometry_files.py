@@ -17,6 +17,7 @@ from scenes import ball_points, ring, small_model
 from hyrfpack.cameras.files import cameras_from_json, cameras_to_json
 from hyrfpack.config.render import GeometryConfig
 from hyrfpack.errors import HyrfError
+from hyrfpack.format import load_model
 from hyrfpack.render.files import make_renderer, render_file_names, render_files
 from hyrfpack.render.geometry_files import GeometryWriter, encode_depth, encode_normals
 
@@ -149,6 +150,30 @@ def test_two_files_of_one_name_are_refused():
     assert len(render_file_names(cameras, GeometryConfig("tiff"))) == 4
     with pytest.raises(HyrfError, match=r"a\.depth\.png: two of the files"):
         render_file_names(cameras, GeometryConfig("png"))
+
+
+def test_files_whose_names_differ_in_case_only_are_refused():
+    with pytest.raises(HyrfError, match=r"[aA]\.depth\.png: two of the files"):
+        render_file_names(["A", "a.depth"], GeometryConfig("png"))
+
+
+def test_a_file_with_the_name_of_a_folder_is_refused():
+    with pytest.raises(HyrfError, match=r"b\.png: a file and a folder"):
+        render_file_names(["b", "b.png/c"])
+
+
+def test_without_overwrite_geometry_is_named_after_the_picture_that_was_written(tmp_path):
+    (tmp_path / "a.png").write_bytes(b"of an earlier run")
+    camera = ring(1, radius=3.0, width=30, height=20)[0]
+    files = render_files(
+        load_model(MODEL_FILE), [("a", camera)], tmp_path, geometry=GeometryConfig("tiff"), overwrite=False
+    )
+    assert [path.name for path in files] == ["a-2.png"]
+    assert sorted(path.name for path in tmp_path.iterdir() if path.suffix != ".lock") == [
+        "a-2.depth.tiff",
+        "a-2.png",
+        "a.png",
+    ]
 
 
 def test_without_the_package_openexr_is_refused_before_any_work(tmp_path, monkeypatch):

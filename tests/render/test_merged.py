@@ -223,3 +223,20 @@ def test_depth_and_normals_are_those_of_the_whole():
     assert agree.float().mean() > 0.99
     both = known & (merged.depth > 0)
     assert float((merged.normals[both] * whole.normals[both]).sum(-1).median()) > 0.999
+
+
+def test_depth_and_normals_of_a_near_small_part_are_those_of_the_part_alone():
+    scene, camera = ball_model(1), CAMERAS[0]
+    scene = moved_model(scene.subset(torch.empty(0, dtype=torch.int64)), WORLD_FRAME)
+    frame = Frame(tuple(camera.position), 0.02, (1.0, 1.0, 1.0))
+    part = moved_model(ball_model(opacity_logits=3.0, background=False), frame)
+    geometry = GeometryConfig(depth="exr", normals="exr")
+    models = part, MergedModel(("scene", "part"), (scene, part))
+
+    with torch.no_grad():
+        alone, merged = (make_renderer(model, geometry=geometry)(camera) for model in models)
+
+    known = alone.depth > 0
+    assert known.float().mean() > 0.05
+    assert ((merged.depth > 0) == known).float().mean() > 0.99
+    torch.testing.assert_close(merged.depth[known].median(), alone.depth[known].median(), rtol=1e-3, atol=0)

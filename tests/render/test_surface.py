@@ -27,6 +27,8 @@ from tools.studies.mesh_error import demo_depth, nearest_surface
 RAW_FILE = Path(__file__).parents[1] / "golden" / "trained" / "demo.hyrf"
 CAMERA = Camera(40, 30, 35.0, 38.0, 18.0, 16.0, np.eye(4))
 
+SETTINGS = RenderSettings().raster_settings(antialiased=False)
+
 
 def rays_of(camera: Camera) -> np.ndarray:
     """Return rays (H, W, 3), camera axes, whose length along the view axis is 1."""
@@ -121,7 +123,9 @@ def test_a_sheet_of_discs_has_its_depth_and_normal_in_world_units_and_axes(rotat
     normal = to_world.apply(local_normal)
     center = np.array(frame.center)
     camera = camera_at(center + to_world.apply((4, 3, 14)), center, width=48, height=48, focal=90.0)
-    depth, normals = render_surface(sheet(local_normal, half=1.5), frame, camera, RenderSettings(), True, normals=True)
+    depth, normals = render_surface(
+        sheet(local_normal, half=1.5), frame, camera, RenderSettings().raster_settings(True), normals=True
+    )
     in_camera = camera.rotation @ normal
     exact = plane_depth(camera, in_camera, float(in_camera @ (camera.rotation @ (center - camera.position))))
     assert normals is not None and bool((depth > 0).all())
@@ -134,7 +138,7 @@ def test_where_gaussians_are_too_faint_there_is_neither_depth_nor_normal():
     gaussians = sheet(np.array([0.0, 0.0, 1.0]), count=40, half=0.2)
     camera = camera_at((0, 0, 3), up=(0, 1, 0), width=48, height=48, focal=30.0)
     frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
-    depth, normals = render_surface(gaussians, frame, camera, RenderSettings(), False, normals=True)
+    depth, normals = render_surface(gaussians, frame, camera, SETTINGS, normals=True)
     assert normals is not None and 0 < (depth > 0).sum() < depth.numel()
     assert bool((normals[depth == 0] == 0).all()) and bool((normals[depth > 0].norm(dim=-1) > 0.99).all())
 
@@ -144,7 +148,7 @@ def test_round_gaussians_take_their_normals_from_depth():
     gaussians = gaussians._replace(scales=torch.full((len(gaussians.means), 3), 0.1))
     camera = camera_at((1, 0.5, 4), up=(0, 1, 0), width=48, height=48, focal=80.0)
     frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
-    _, normals = render_surface(gaussians, frame, camera, RenderSettings(), False, normals=True)
+    _, normals = render_surface(gaussians, frame, camera, SETTINGS, normals=True)
     assert normals is not None
     assert np.median(angles(normals.numpy(), np.array([0.0, 0.0, 1.0]))) < 10
 

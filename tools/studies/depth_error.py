@@ -78,13 +78,14 @@ def print_errors(model: HybridModel, cameras: list[Camera], geometry: Geometry) 
     """Print tables of the errors of depths and of normals."""
     depth_errors: dict[str, list[np.ndarray]] = {"expected": [], "median": []}
     angles: dict[str, list[np.ndarray]] = {name: [] for name in DEPTH_NORMAL_WEIGHTS}
-    decoded, frame, antialiased = model.decode(), model.config.frame, model.config.antialiased
+    decoded, frame = model.decode(), model.config.frame
+    settings = RenderSettings().raster_settings(model.config.antialiased)
     for camera in cameras:
         exact, exact_normals = geometry(camera)
         seen = render_view(model, camera, decoded=decoded, depth=True)
         assert seen.depth is not None
         gaussians, _ = surface.drawn_gaussians(model, camera, decoded, seen.indices[seen.visible])
-        depth, _ = surface.render_surface(gaussians, frame, camera, RenderSettings(), antialiased, normals=False)
+        depth, _ = surface.render_surface(gaussians, frame, camera, settings, normals=False)
         known = np.isfinite(exact) & (depth.numpy() > 0)
         for name, found in (("expected", seen.depth), ("median", depth)):
             depth_errors[name].append(np.abs(found.numpy() - exact)[known] / exact[known])
@@ -92,9 +93,7 @@ def print_errors(model: HybridModel, cameras: list[Camera], geometry: Geometry) 
         faces_away = (exact_normals * rays).sum(axis=-1, keepdims=True) > 0
         exact_normals = np.where(faces_away, -exact_normals, exact_normals)
         for name, weight in DEPTH_NORMAL_WEIGHTS.items():
-            normals = surface.render_normals(
-                gaussians, depth, frame, camera, RenderSettings(), antialiased, depth_weight=weight
-            )
+            normals = surface.render_normals(gaussians, depth, frame, camera, settings, depth_weight=weight)
             cosines = (normals.numpy() * exact_normals).sum(axis=-1)[known]
             angles[name].append(np.degrees(np.arccos(cosines.clip(-1, 1))))
     rows = [[name, *statistics(np.concatenate(parts))] for name, parts in depth_errors.items()]
