@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from hyrfpack.errors import HyrfError, short_reason
 
 MAX_REASON_LENGTH = 160
+GPU_PROBLEM = "the GPU's memory ran out"
 # What CUDA, HIP, their libraries (cuBLAS, cuDNN) and Triton say where torch's allocator was not asked: a library's
 # memory, a kernel's code or stack.
 _GPU_MESSAGE = re.compile(
@@ -20,6 +21,8 @@ _GPU_MESSAGE = re.compile(
 def explain_out_of_memory(fix: str) -> Iterator[None]:
     """Raise a HyrfError with this fix if memory runs out in the block. It also serves as a decorator.
 
+    If it is the memory of a GPU, the fix says that the CPU can be used, too.
+
     Raises:
         HyrfError: memory ran out.
     """
@@ -29,7 +32,9 @@ def explain_out_of_memory(fix: str) -> Iterator[None]:
         problem = describe_out_of_memory(error)
         if problem is None:
             raise
-        raise HyrfError(problem, fix=fix) from error
+        raise HyrfError(
+            problem, fix=f"{fix}, or use `device='cpu'`" if problem.startswith(GPU_PROBLEM) else fix
+        ) from error
 
 
 def has_run_out_of_memory(error: BaseException) -> bool:
@@ -45,7 +50,7 @@ def describe_out_of_memory(error: BaseException) -> str | None:
     """
     is_gpu_message = isinstance(error, RuntimeError) and _GPU_MESSAGE.search(str(error))
     if type(error).__name__ == "OutOfMemoryError" or is_gpu_message:
-        return f"the GPU's memory ran out ({short_reason(error, MAX_REASON_LENGTH)})"  # type: ignore[arg-type]
+        return f"{GPU_PROBLEM} ({short_reason(error, MAX_REASON_LENGTH)})"  # type: ignore[arg-type]
     if isinstance(error, MemoryError):
         return f"memory ran out ({short_reason(error, MAX_REASON_LENGTH)})"
     if isinstance(error, RuntimeError) and "DefaultCPUAllocator" in str(error):

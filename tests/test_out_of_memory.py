@@ -22,7 +22,9 @@ def fail(*arguments, **options):
 def test_a_gpu_without_memory_is_one_sentence():
     with pytest.raises(HyrfError) as caught, explain_out_of_memory("reduce it"):
         fail()
-    expected = "the GPU's memory ran out (CUDA out of memory. Tried to allocate 2.00 GiB.); reduce it"
+    expected = (
+        "the GPU's memory ran out (CUDA out of memory. Tried to allocate 2.00 GiB.); reduce it, or use `device='cpu'`"
+    )
     assert str(caught.value) == expected
 
 
@@ -42,12 +44,13 @@ def test_a_gpu_without_memory_is_one_sentence():
 def test_errors_of_the_driver_and_of_triton_that_memory_ran_out_are_recognised(message):
     with pytest.raises(HyrfError) as caught, explain_out_of_memory("reduce it"):
         raise RuntimeError(message)
-    assert str(caught.value) == f"the GPU's memory ran out ({message.splitlines()[0]}); reduce it"
+    said = f"the GPU's memory ran out ({message.splitlines()[0]}); reduce it"
+    assert str(caught.value).startswith(said)
 
 
 @pytest.mark.parametrize("allocate", [lambda: torch.empty(1 << 55), lambda: bytearray(1 << 55)])
 def test_a_machine_without_memory_is_one_sentence(allocate):
-    with pytest.raises(HyrfError, match=r"memory ran out \(.*\); reduce it"), explain_out_of_memory("reduce it"):
+    with pytest.raises(HyrfError, match=r"memory ran out \(.*\); reduce it$"), explain_out_of_memory("reduce it"):
         allocate()
 
 

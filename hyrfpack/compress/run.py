@@ -38,7 +38,7 @@ ENCODING_START_SHARE = 0.7
 SEARCH_ENCODING_START_SHARE = 0.3
 
 
-@explain_out_of_memory("reduce `max_size` of the photos, or use `device='cpu'`")
+@explain_out_of_memory("reduce `max_size` of the photos")
 def compress_model(
     source: StrPath,
     target: StrPath,

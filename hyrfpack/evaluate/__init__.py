@@ -72,7 +72,7 @@ class Evaluation:
         return asdict(self)
 
 
-@explain_out_of_memory("reduce `max_size`, or use `device='cpu'`")
+@explain_out_of_memory("reduce `max_size`")
 @torch.no_grad()
 def evaluate_model(
     model: HybridModel | MergedModel | Drawable,

@@ -76,7 +76,7 @@ class ImportReport:
         return asdict(self)
 
 
-@explain_out_of_memory("reduce `size`, or use `device='cpu'`")
+@explain_out_of_memory("reduce `size`")
 def import_splats(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],

@@ -134,7 +134,7 @@ class RenderedPicture:
     normals: Tensor | None = None
 
 
-@explain_out_of_memory("render a smaller picture or a model of fewer Gaussians, or use `device='cpu'`")
+@explain_out_of_memory("render a smaller picture or a model of fewer Gaussians")
 @torch_on_one_thread()
 def render_view(
     model: HybridModel | MergedModel,
