@@ -184,7 +184,7 @@ def test_numbers_that_are_not_finite_are_rejected(gpu, part, kept):
             getattr(model.gaussians, part)[3, 0] = float("nan")
         model = model.to(gpu)
         decoded = model.decode() if kept else None
-        with pytest.raises(hyrfpack.HyrfError, match="NaN or infinity"):
+        with pytest.raises(hyrfpack.HyrfError, match="NaN or infinite"):
             render_view(model, camera_at((0.3, -2.2, 0.6), width=16, height=16), decoded=decoded)
 
 
