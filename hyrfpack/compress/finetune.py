@@ -22,7 +22,7 @@ from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate.exposure import fit_gains
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.model import HybridModel
-from hyrfpack.model.exposure import apply_exposure_gains
+from hyrfpack.model.exposure import apply_exposure_gains, clamp_colors
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.ops.transfer import HostCopy
 from hyrfpack.parallel.pool import freed_memory_kept, torch_on_one_thread
@@ -193,7 +193,7 @@ class _Finetuner:
             rendering = render_view(self.model, view.camera, reserve=reserve)
             image = rendering.rgb
             if self.gains is not None:
-                image = apply_exposure_gains(image, self.gains[view.name])
+                image = apply_exposure_gains(clamp_colors(image), self.gains[view.name])
             loss = photometric_loss(image, target, mask)
             loss.backward()
         return _BackpropagatedView(view, picture, loss.detach(), quantized.rate_gradients, rendering.demand, reserve)

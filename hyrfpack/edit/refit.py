@@ -25,7 +25,7 @@ from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import psnr, to_8bit
 from hyrfpack.model import Geometry, HybridModel
-from hyrfpack.model.exposure import apply_exposure_gains
+from hyrfpack.model.exposure import apply_exposure_gains, clamp_colors
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.parallel.pool import freed_memory_kept, parallel_map, torch_on_one_thread
@@ -96,7 +96,7 @@ def refit(
             settings = replace(resolution.render_settings(view.camera, step + 1), exposure=AS_PHOTOGRAPHED)
             image = render_view(trained, view.camera, settings).rgb
             if view.name in gains:
-                image = apply_exposure_gains(image.clamp(0, 1), gains[view.name])
+                image = apply_exposure_gains(clamp_colors(image), gains[view.name])
             loss = photometric_loss(image, target, mask)
             if not loss.isfinite():
                 raise HyrfError(f"{view.name}: the loss is not finite", fix="leave out this photo")

@@ -14,7 +14,7 @@ from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.exposure import BakeGains
 from hyrfpack.model import Geometry, HybridModel
-from hyrfpack.model.exposure import apply_exposure_gains
+from hyrfpack.model.exposure import apply_exposure_gains, clamp_colors
 from hyrfpack.model.residuals import add_color_residuals
 from hyrfpack.ops.harmonics import harmonics_basis, num_sh_bases
 from hyrfpack.ops.least_squares import least_squares
@@ -296,7 +296,7 @@ def _centered_colors(
     colors = logits.add_(shading.color_logits[index]).sigmoid_()
     if residuals is not None:
         colors = add_color_residuals(colors, residuals[index], directions)
-    return (colors if gains is None else apply_exposure_gains(colors.clamp(0, 1), gains)).sub_(0.5)
+    return (colors if gains is None else apply_exposure_gains(clamp_colors(colors), gains)).sub_(0.5)
 
 
 def check_finite(name: str, values: Tensor) -> None:

@@ -8,10 +8,11 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from copy import deepcopy
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hyrfpack.errors import HyrfFormatError, short_reason
 from hyrfpack.format.container import Container, open_regular_file, raw_bytes_limit, read_container
@@ -46,7 +47,8 @@ def is_scene(path: StrPath) -> bool:
     if not (path.is_dir() or path.name == MANIFEST_NAME or _is_zip(path)):
         return False
     try:  # Other programs write files of this name, too.
-        return FORMAT_NAME.encode() in _SceneFiles(path).read(MANIFEST_NAME, MAX_MANIFEST_BYTES)
+        with closing(_SceneFiles(path)) as files:
+            return FORMAT_NAME.encode() in files.read(MANIFEST_NAME, MAX_MANIFEST_BYTES)
     except HyrfFormatError:
         return False
 
@@ -60,28 +62,39 @@ class _SceneFiles:
     """
 
     def __init__(self, path: Path) -> None:
-        """Find the files of a scene folder, of the folder of a manifest, or of a .zip, which stays open."""
-        self._archive: zipfile.ZipFile | None = None
+        """Find the files of a scene folder, of the folder of a manifest, or of a .zip."""
+        self.is_folder = not _is_zip(path)
         self._prefix = ""  # the folder within the .zip, "" or "name/"
-        if _is_zip(path):
+        self._opened: tuple[int, zipfile.ZipFile] | None = None  # the archive and the process that opened it
+        if self.is_folder:
+            self.path = path.parent if path.name == MANIFEST_NAME and not path.is_dir() else path
+        else:
             self.path = path
             with _naming_errors(path):
-                self._archive = zipfile.ZipFile(path)
-                self._prefix = _find_prefix(self._archive)
-        else:
-            self.path = path.parent if path.name == MANIFEST_NAME and not path.is_dir() else path
+                self._prefix = _find_prefix(self._archive())
 
-    @property
-    def is_folder(self) -> bool:
-        return self._archive is None
+    def _archive(self) -> zipfile.ZipFile:
+        """Return the .zip, which stays open. Forked processes open it anew, because they would share its position."""
+        if self._opened is None or self._opened[0] != os.getpid():
+            self._opened = os.getpid(), zipfile.ZipFile(self.path)
+        return self._opened[1]
+
+    def close(self) -> None:
+        """Close the .zip, if it is open; a later read opens it again."""
+        opened, self._opened = self._opened, None
+        if opened is not None:
+            opened[1].close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_opened": None}
 
     def read(self, name: str, limit: int) -> bytes:
         """Return the bytes of a file, at most `limit` and one more; nothing is read of a file that unpacks to more."""
         with _naming_errors(self.path / name):
-            if self._archive is None:
+            if self.is_folder:
                 with open_regular_file(self.path / name) as file:
                     return file.read(limit + 1)
-            info = self._archive.getinfo(self._prefix + name)
+            info = self._archive().getinfo(self._prefix + name)
             # An archive may declare any size, and some of its codecs shrink zeros without limit.
             allowed = raw_bytes_limit(info.compress_size)
             if info.file_size > allowed:
@@ -90,15 +103,15 @@ class _SceneFiles:
                     f"than {allowed:,}",
                     fix=COPY_AGAIN,
                 )
-            with self._archive.open(info) as member:
+            with self._archive().open(info) as member:
                 return member.read(limit + 1)
 
     def size(self, name: str) -> int:
         """Return the size of a file."""
         with _naming_errors(self.path / name):
-            if self._archive is None:
+            if self.is_folder:
                 return os.stat(self.path / name).st_size
-            return self._archive.getinfo(self._prefix + name).file_size
+            return self._archive().getinfo(self._prefix + name).file_size
 
 
 @contextmanager
@@ -106,7 +119,7 @@ def _naming_errors(path: Path) -> Iterator[None]:
     """Turn whatever is raised where a file is opened, read or unpacked into a HyrfFormatError that names the file."""
     try:
         yield
-    except HyrfFormatError:
+    except (HyrfFormatError, MemoryError):
         raise
     except (FileNotFoundError, KeyError, NotADirectoryError) as error:
         raise HyrfFormatError(f"{path}: this file of the scene is missing", fix=COPY_AGAIN) from error
@@ -140,6 +153,14 @@ class SceneFolder:
         self.path = self._files.path
         data = self._files.read(MANIFEST_NAME, MAX_MANIFEST_BYTES)
         self.manifest: Manifest = parse_manifest(data, str(self.path / MANIFEST_NAME))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: shared files are opened again when they are needed."""
+        return {name: value for name, value in self.__dict__.items() if name != "_shared_files"}
+
+    def close(self) -> None:
+        """Close a .zip, which is kept open between reads; a later read opens it again."""
+        self._files.close()
 
     def read_file(self, item: SceneFile) -> bytes:
         """Return the bytes of a file, after a check of its size and its checksum.
@@ -238,7 +259,7 @@ class SceneFolder:
 
     def read_provenances(self) -> list[dict]:
         """Return the provenance of each part."""
-        return [read_metadata(container).provenance for container in self._shared_files]
+        return [deepcopy(read_metadata(container).provenance) for container in self._shared_files]
 
     def load_chunk(self, number: int, level: int = 0) -> HybridModel:
         """Return the model of one chunk at a level of detail, whose fields are those of its part.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
+from copy import deepcopy
 from dataclasses import replace
 
 from hyrfpack.errors import HyrfFormatError
@@ -78,8 +79,10 @@ def read_section(container: Container, tag: str) -> Section:
 
 def read_provenance(container: Container) -> dict:
     """Return the provenance of a file. A chunk of a scene has that of the file with its shared sections, too."""
-    own = read_metadata(container).provenance
-    return {**read_metadata(open_shared(container)).provenance, **own} if has_shared_sections(container) else own
+    own = deepcopy(read_metadata(container).provenance)
+    if not has_shared_sections(container):
+        return own
+    return {**deepcopy(read_metadata(open_shared(container)).provenance), **own}
 
 
 def self_contained_bytes(container: Container) -> bytes:

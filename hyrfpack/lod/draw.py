@@ -65,6 +65,8 @@ class LevelRenderer:
     def load(self, camera: Camera) -> tuple[HybridModel | MergedModel, LevelSelection]:
         """Return a model of the levels that are chosen for a view, and the choice.
 
+        Views with the same levels in a row share one model.
+
         Raises:
             HyrfFormatError: a file is missing or damaged.
         """
@@ -85,7 +87,8 @@ class LevelRenderer:
         """Render a view at the levels that are chosen for it. The arguments are those of `make_renderer`."""
         model, _ = self.load(camera)
         last = self._last_renderer
-        if last is None or last[0] is not geometry or last[1] is not settings:
+        if last is None or last[:2] != (geometry, settings):
+            self._last_renderer = None  # frees the memory before the model is decoded again
             last = self._last_renderer = geometry, settings, make_renderer(model, geometry=geometry, settings=settings)
         return last[2](camera)
 

@@ -26,7 +26,16 @@ from hyrfpack.format.part_names import ONE_PART_NAME, list_parts
 from hyrfpack.format.parts import decode_parts
 from hyrfpack.format.run_folder import find_model, name_model
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
-from hyrfpack.format.scene_manifest import MANIFEST_NAME, Chunk, ChunkLevel, Manifest, ScenePart, parse_manifest
+from hyrfpack.format.scene_manifest import (
+    MANIFEST_NAME,
+    MAX_CHUNKS,
+    MAX_MANIFEST_BYTES,
+    Chunk,
+    ChunkLevel,
+    Manifest,
+    ScenePart,
+    parse_manifest,
+)
 from hyrfpack.format.scene_model import join_parts
 from hyrfpack.format.sections import SECTION_CONTENTS
 from hyrfpack.lock import exclusive_folder
@@ -350,9 +359,12 @@ def _make_manifest(
 
 def _check_manifest(manifest: Manifest, path: Path) -> None:
     """Raise HyrfError unless readers will accept the manifest; its size and its number of chunks are limited."""
+    data = manifest.to_json()
     try:
-        parse_manifest(manifest.to_json(), str(path))
+        parse_manifest(data, str(path))
     except HyrfFormatError as error:
+        if len(data) <= MAX_MANIFEST_BYTES and len(manifest.chunks) <= MAX_CHUNKS:
+            raise HyrfError(error.problem, fix="train the model again") from error
         raise HyrfError(
             error.problem, fix="split into fewer chunks with a larger `chunk_gaussians`, or into fewer `levels`"
         ) from error

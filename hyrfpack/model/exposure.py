@@ -42,6 +42,16 @@ def apply_exposure_gains(image: Tensor, gains: Tensor) -> Tensor:
     return gains * image / (1 + (gains - 1) * image)
 
 
+def clamp_colors(image: Tensor) -> Tensor:
+    """Return an image (..., 3) with colours clamped to [0, 1], for which exposure gains are defined.
+
+    Colour residuals can make colours brighter than white. The gradient is that of the image itself, so that training
+    can darken them.
+    """
+    values = image.detach()
+    return image + (values.clamp(0, 1) - values)
+
+
 def inverse_quadratic_kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the inverse quadratic kernel 1 / (1 + |a - b|^2), (N, M), of features (N, D) and (M, D).
 

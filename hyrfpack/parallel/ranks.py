@@ -159,13 +159,13 @@ class Ranks:
         Raises:
             HyrfError: some rank has an error.
         """
-        errors = self.all_gather(None if problem is None else problem.with_text())  # a copy without its traceback
-        failed = [(rank, error) for rank, error in enumerate(errors) if error is not None]
+        errors = self.all_gather(None if problem is None else (_known_type(problem), problem.problem, problem.fix))
+        failed = [(rank, *error) for rank, error in enumerate(errors) if error is not None]
         if problem is not None and len(failed) == self.size:
             raise problem  # If all processes fail, each raises its own error, as a single process would.
         if failed:
-            rank, error = failed[0]
-            raise error.with_text(f"process {rank} of {self.size}: {error.problem}") from problem
+            rank, kind, what, fix = failed[0]
+            raise kind(f"process {rank} of {self.size}: {what}", fix=fix) from problem
 
     def raise_if_lost(self) -> None:
         """Raise an error if another process has ended. This is not collective.
@@ -196,6 +196,11 @@ class Ranks:
             f"one of the {self.size} processes has ended or does not respond ({reason})",
             fix="read the messages of that process, and check whether memory ran out",
         )
+
+
+def _known_type(error: HyrfError) -> type[HyrfError]:
+    """Return the type of an error if hyrfpack defines it, else HyrfError: other types may take other arguments."""
+    return type(error) if type(error).__module__ == HyrfError.__module__ else HyrfError
 
 
 SINGLE_PROCESS = Ranks()

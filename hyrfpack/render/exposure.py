@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from hyrfpack.model import HybridModel
-from hyrfpack.model.exposure import apply_exposure_gains
+from hyrfpack.model.exposure import apply_exposure_gains, clamp_colors
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.scene import Camera
 
@@ -25,4 +25,4 @@ def apply_exposure_map(model: HybridModel, camera: Camera, rgb: Tensor) -> Tenso
     if model.exposure is None:
         return rgb
     gains = model.exposure.predict_gains(model.config.frame.local_pose(camera))
-    return apply_exposure_gains(rgb.clamp(0, 1), tensor_like(gains.tolist(), rgb))
+    return apply_exposure_gains(clamp_colors(rgb), tensor_like(gains.tolist(), rgb))

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.model import Decoded, Frame, HybridModel
-from hyrfpack.model.exposure import apply_exposure_gains
+from hyrfpack.model.exposure import apply_exposure_gains, clamp_colors
 from hyrfpack.model.merged import MergedModel
 from hyrfpack.ops.poses import camera_center
 from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
@@ -117,7 +117,7 @@ def expose_parts(
     ends = torch.tensor([len(part) for part in model.parts], device=index.device).cumsum(0)
     blended = rasterize(gaussians, log_gains[torch.bucketize(index, ends, right=True)], viewport, settings)
     behind = blended.transmittance[..., None] * log_gains[0]
-    return apply_exposure_gains(rgb.clamp(0, 1), (blended.rgb + behind).exp())
+    return apply_exposure_gains(clamp_colors(rgb), (blended.rgb + behind).exp())
 
 
 def _predict_log_gains(model: HybridModel, camera: Camera) -> list[float]:

@@ -204,9 +204,10 @@ def render_view(
                 gaussians = widen_to_photos(gaussians, sizes[index], viewport, antialiased=model.config.antialiased)
         gradients = positions.new_zeros(len(index), 2) if absgrad else None
         raster_settings = raster_settings_of(model, settings, depth)
+        is_shaded = isinstance(colors, Shading)  # and has no gradients
         raster = rasterize(
-            gaussians, colors, raster_viewport, raster_settings,
-            absgrad=gradients, used=used, reserve=reserve.pairs if reserve else None,
+            gaussians, colors, raster_viewport, raster_settings, absgrad=None if is_shaded else gradients, used=used,
+            reserve=None if is_shaded or reserve is None else reserve.pairs,
         )  # fmt: skip
     except FloatingPointError:
         raise _nonfinite_error("positions") from None

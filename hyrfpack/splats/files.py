@@ -1,4 +1,4 @@
-"""Reading of splat files, by the formats that their endings name."""
+"""Reading and writing of splat files, by the formats that their endings name."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from hyrfpack.choices import DEFAULT_SPZ_VERSION
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.scene import MAX_WORLD_COORDINATE
+from hyrfpack.scene import MAX_WORLD_COORDINATE, Camera
 from hyrfpack.splats.formats import sog
+from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS
 
@@ -18,6 +20,24 @@ READABLE_ENDINGS = tuple(ending for ending, row in FORMATS.items() if row.is_rea
 MAX_HEADER_BYTES_SEARCHED = 65536
 MAX_LISTED_NAMES = 4
 MAX_FILE_BYTES = 1 << 32  # a PLY of this size holds 17 million Gaussians
+
+
+def encode_splats(
+    splats: Splats, extension: str, *, up: np.ndarray, camera: Camera | None, spz_version: int = DEFAULT_SPZ_VERSION
+) -> bytes:
+    """Encode splats as the bytes of a file.
+
+    Args:
+        splats: the splats, in the axes and units of the file.
+        extension: ending of the format, one of FORMATS. ".splat" holds no harmonics beyond degree 0.
+        up: (3,) unit vector in world axes that points up, for the formats that store it (glTF, USD).
+        camera: initial camera, for the formats that store one (USD).
+        spz_version: version of ".spz" files, 3 or 4, see `Hints`.
+
+    Raises:
+        HyrfError: the format's package is missing.
+    """
+    return FORMATS[extension].encode(splats, Hints(up, camera, spz_version))
 
 
 def read_splats(path: str | os.PathLike[str]) -> Splats:

@@ -25,9 +25,9 @@ _MIN_SET_LUMINANCE = 0.02  # a set with a lower median of the mean luminances is
 _DARK_PHOTO_STOPS = 3.0  # a photo this far below the median of its set is dark
 _MAX_CLIPPED_PIXEL_RATIO = 0.25
 _SAME_ZOOM_TOLERANCE = 0.03  # EXIF rounds focal lengths by up to this ratio
-# Files of the same size are compared by so many bytes at their start and from their middle on. Those that agree are
-# compared as a whole, which takes minutes if all photos of a large set are there twice; then further ones count as
-# copies without it.
+# Files of the same size are compared by so many bytes at their start, from their middle on, and at their end. Longer
+# files that agree are compared as a whole, which takes minutes if all photos of a large set are there twice; then
+# further ones count as copies without it.
 _SAMPLE_BYTES = 1 << 16
 _MAX_HASHED_PHOTOS = 100
 _SAME_PICTURE_MAX_LEVELS = 1.0  # thumbnails of the same picture differ by less, in levels of 255 on average
@@ -89,7 +89,8 @@ def find_copy_problems(
     to_hash: list[Path] = []
     not_hashed: list[list[Path]] = []
     for group in same_samples:
-        if len(group) > 1 and len(to_hash) + len(group) <= _MAX_HASHED_PHOTOS:
+        is_compared = group[0].stat().st_size <= 3 * _SAMPLE_BYTES
+        if len(group) > 1 and not is_compared and len(to_hash) + len(group) <= _MAX_HASHED_PHOTOS:
             to_hash += group
         else:
             not_hashed.append(group)
@@ -114,11 +115,13 @@ def _group_files(files: Iterable[Path], describe: Callable[[Path], Hashable]) ->
 
 
 def _digest_samples(file: Path) -> bytes:
-    """Return a digest of the first bytes of a file and of those from its middle on."""
+    """Return a digest of samples of a file: its start, its middle and its end; of a short file, all of its bytes."""
+    size, digest = file.stat().st_size, hashlib.sha256()
     with file.open("rb") as opened:
-        start = opened.read(_SAMPLE_BYTES)
-        opened.seek(file.stat().st_size // 2)
-        return hashlib.sha256(start + opened.read(_SAMPLE_BYTES)).digest()
+        for place in (0, (size - _SAMPLE_BYTES) // 2, size - _SAMPLE_BYTES):
+            opened.seek(max(0, place))
+            digest.update(opened.read(_SAMPLE_BYTES))
+    return digest.digest()
 
 
 def find_blur_problems(measurements: list[PhotoMeasurement], blurred: list[Path], folder: Path) -> list[str]:

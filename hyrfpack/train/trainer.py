@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hyrfpack.checks import check_float, check_int
 from hyrfpack.config.train import FIELD_WARMUP_STEPS, TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.device import Photos, upload_array
@@ -547,6 +548,7 @@ class Trainer:
         }
         save_checkpoint(path, settings=self._settings(), tensors=tensors, progress=progress, overwrite=overwrite)
 
+    @explain_out_of_memory(OUT_OF_MEMORY_FIX)
     def load(self, path: Path) -> None:
         """Resume from the checkpoint at `path`, so that the result equals that of an uninterrupted run.
 
@@ -554,6 +556,7 @@ class Trainer:
 
         Raises:
             HyrfTrainingError: as `load_checkpoint`.
+            HyrfError: memory ran out.
         """
         saved = self.ranks.run_on_all(
             lambda: load_checkpoint(path, self._settings()) if self.ranks.is_main else ({}, {})
@@ -562,10 +565,16 @@ class Trainer:
         try:
             self._resume(tensors, progress)
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            if has_run_out_of_memory(error):
+                raise
             raise damaged_checkpoint(path) from error
 
     def _resume(self, tensors: dict[str, Tensor], progress: dict) -> None:
-        """Restore the state of a checkpoint's tensors and progress."""
+        """Restore the state of a checkpoint's tensors and progress; any error means that they are not as saved."""
+        check_int("step", progress["step"], 0, self.steps)
+        check_float("elapsed", progress["elapsed"])
+        if not isinstance(progress["records"], list):
+            raise ValueError("the records are no list")
         self.spacing = progress.get("spacing", self.spacing)  # Checkpoints of earlier versions do not have it.
         self.learning_rates = self.config.learning_rates.at_spacing(self.spacing)
         self._restore(tensors)

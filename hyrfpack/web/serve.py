@@ -209,7 +209,9 @@ class _Handler(BaseHTTPRequestHandler):
     def _send_file(self, served: Path | OpenableFile) -> None:
         try:
             file, size, tag = _open_on_disk(served) if isinstance(served, Path) else served.open()
-        except (OSError, HyrfError):
+        except (OSError, HyrfError) as error:
+            if isinstance(error, HyrfError):
+                _LOG.warning(f"{error}")
             self.send_error(HTTPStatus.NOT_FOUND, explain="The file that was served here is gone or cannot be read.")
             return
         with file:

@@ -6,6 +6,7 @@ import io
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -46,16 +47,24 @@ def view(
     serve(page, files, host=host, port=port, open_browser=open_browser, on_ready=on_ready)
 
 
+MAX_UNPACKED_FILES = 2  # Browsers may request a file piece by piece.
+
+
 @dataclass(frozen=True)
 class _ArchivedFile:
-    """A file of a scene in a .zip, which each request reads, so that large scenes are not held in memory."""
+    """A file of a scene in a .zip, which is read when it is requested, so that large scenes are not held in memory.
 
-    scene: SceneFolder
+    Attributes:
+        read: returns the bytes of a file of the scene, after a check of its checksum.
+        item: the file.
+    """
+
+    read: Callable[[SceneFile], bytes]
     item: SceneFile
 
     def open(self) -> tuple[BinaryIO, int, str]:
-        """Return the file for reading, its length in bytes and its ETag, after a check of its checksum."""
-        data = self.scene.read_file(self.item)
+        """Return the file for reading, its length in bytes and its ETag."""
+        data = self.read(self.item)
         return io.BytesIO(data), len(data), f'"{self.item.crc32}-{len(data):x}"'
 
 
@@ -64,9 +73,9 @@ def _scene_page(path: str | os.PathLike[str]) -> tuple[bytes, ServedFiles]:
     scene = SceneFolder(path)
     scene.check_files()
     files: dict[str, Path | OpenableFile] = {FOLDER_ADDRESS + MANIFEST_NAME: MemoryFile(scene.manifest.to_json())}
-    is_folder = scene.path.is_dir()
+    is_folder, read = scene.path.is_dir(), lru_cache(MAX_UNPACKED_FILES)(scene.read_file)
     for item in scene.manifest.files:
-        files[FOLDER_ADDRESS + item.file] = scene.path / item.file if is_folder else _ArchivedFile(scene, item)
+        files[FOLDER_ADDRESS + item.file] = scene.path / item.file if is_folder else _ArchivedFile(read, item)
     title = scene.manifest.title or name_model(scene.path) or "scene"
     return encode_player(title, content=FOLDER_ADDRESS + MANIFEST_NAME, fetches="'self'"), files
 

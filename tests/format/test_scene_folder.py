@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
+import pickle
 import shutil
 import zipfile
 import zlib
@@ -124,3 +126,53 @@ def test_a_named_pipe_among_the_files_is_refused_without_waiting_for_a_writer(tm
 
     with pytest.raises(HyrfFormatError, match=f"{name}: (this is not a regular file|the manifest says)"):
         SceneFolder(folder).load()
+
+
+def read_often(scene: SceneFolder, failures: multiprocessing.Queue) -> None:
+    count = 0
+    for _ in range(50):
+        for item in scene.manifest.files:
+            try:
+                scene.read_file(item)
+            except HyrfFormatError:
+                count += 1
+    failures.put(count)
+
+
+@pytest.mark.integration
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="processes cannot fork")
+def test_forked_processes_read_an_archive_at_once(tmp_path):
+    scene = SceneFolder(write_zip(tmp_path / "scene.zip", zipfile.ZIP_STORED))
+    fork = multiprocessing.get_context("fork")
+    failures = fork.Queue()
+    processes = [fork.Process(target=read_often, args=(scene, failures)) for _ in range(2)]
+    for process in processes:
+        process.start()
+    assert [failures.get(timeout=60) for _ in processes] == [0, 0]
+    for process in processes:
+        process.join()
+
+
+def test_a_scene_is_pickled_and_closed_and_still_read(tmp_path):
+    scene = SceneFolder(write_zip(tmp_path / "scene.zip", zipfile.ZIP_STORED))
+    count = len(scene.load_chunk(0))
+    scene.close()
+    assert len(scene.load_chunk(0)) == count
+    assert len(pickle.loads(pickle.dumps(scene)).load_chunk(0)) == count
+
+
+def test_running_out_of_memory_is_no_damage_of_an_archive(tmp_path, monkeypatch):
+    path = write_zip(tmp_path / "scene.zip", zipfile.ZIP_STORED)
+
+    def fail(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(zipfile.ZipFile, "open", fail)
+    with pytest.raises(MemoryError):
+        is_scene(path)
+
+
+def test_a_caller_that_changes_provenances_changes_no_later_ones():
+    scene = SceneFolder(GOLDEN_SCENE_FOLDER)
+    scene.read_provenances()[0]["added"] = 1
+    assert "added" not in scene.read_provenances()[0]

@@ -272,6 +272,7 @@ def test_texts_that_a_manifest_cannot_hold_are_refused_before_the_work(text, tmp
 
 def test_a_manifest_that_readers_would_refuse_is_not_written(tmp_path, monkeypatch):
     monkeypatch.setattr(scene_manifest, "MAX_CHUNKS", 2)
+    monkeypatch.setattr("hyrfpack.lod.split.MAX_CHUNKS", 2)
     with pytest.raises(HyrfError, match=r"'chunks' has 4 entries.*`chunk_gaussians`"):
         split_model(RAW_FILE, tmp_path / "scene", SplitConfig(chunk_gaussians=400, levels=1), context=QUIET_CONTEXT)
     assert not (tmp_path / "scene").exists()

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scenes import ball_points, ball_scene, small_model
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE
-from hyrfpack.model.exposure import MAX_CENTERS, ExposureMap, apply_exposure_gains
+from hyrfpack.model.exposure import MAX_CENTERS, ExposureMap, apply_exposure_gains, clamp_colors
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.render import RenderSettings, render_view
 
@@ -129,6 +129,14 @@ def test_colours_above_one_are_white_at_any_exposure():
     exposed = render_view(bright, camera).rgb
     assert plain.max() > 2 and (plain >= 1).float().mean() > 0.01
     assert bool((exposed[plain >= 1] == 1).all()) and bool(((exposed >= 0) & (exposed <= 1)).all())
+
+
+def test_colours_above_one_are_clamped_with_a_gradient_that_darkens_them():
+    image = torch.tensor([-0.2, 0.0, 0.4, 1.0, 1.5], requires_grad=True)
+    clamped = clamp_colors(image)
+    torch.testing.assert_close(clamped.detach(), torch.tensor([0.0, 0.0, 0.4, 1.0, 1.0]), rtol=0, atol=1e-7)
+    clamped.sum().backward()
+    assert image.grad is not None and image.grad.tolist() == [1.0] * 5
 
 
 def test_render_differentiates_through_the_map():

@@ -218,6 +218,20 @@ def test_the_number_of_torch_threads_is_unchanged() -> None:
     assert torch.get_num_threads() == before
 
 
+def test_hidden_layers_are_kept_only_where_gradients_are_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    from hyrfpack.ops.mlp import cpu
+
+    allocate, calls = cpu.allocate_hidden, []
+    monkeypatch.setattr(cpu, "allocate_hidden", lambda *arguments: calls.append(arguments) or allocate(*arguments))
+    weights, biases = ([torch.nn.Parameter(values) for values in parameters] for parameters in layers_for(8, 16, 16, 3))
+
+    with torch.no_grad():
+        result = mlp(normal(50, 8), weights, biases)
+    assert not calls
+    torch.testing.assert_close(mlp(normal(50, 8), weights, biases).detach(), result, rtol=0, atol=0)
+    assert len(calls) == 1
+
+
 def test_auto_uses_the_reference_for_float64() -> None:
     weights, biases = layers_for(4, 3)
     result = mlp(normal(5, 4).double(), [weights[0].double()], [biases[0].double()])

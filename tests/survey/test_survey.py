@@ -113,6 +113,7 @@ def test_of_large_sets_few_photos_are_read_whole_to_find_copies(photos, monkeypa
     read_bytes, read = Path.read_bytes, []
     monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path.name) or read_bytes(path))
     monkeypatch.setattr("hyrfpack.survey.problems._MAX_HASHED_PHOTOS", 5)
+    monkeypatch.setattr("hyrfpack.survey.problems._SAMPLE_BYTES", 64)
     assert "3 photos are a copy" in find_problem(describe_photos(photos), "3 photos are a copy")
     assert read == ["001 (1).jpg", "001.jpg", "002 (1).jpg", "002.jpg"]
 
@@ -128,6 +129,7 @@ def test_photos_that_become_unreadable_do_not_end_the_search_for_copies(photos, 
         return read_bytes(path)
 
     monkeypatch.setattr(Path, "read_bytes", deny_some)
+    monkeypatch.setattr("hyrfpack.survey.problems._SAMPLE_BYTES", 64)
     assert "002.jpg of 002 (1).jpg" in find_problem(describe_photos(photos), "1 photo is a copy")
 
 

@@ -336,7 +336,12 @@ def test_a_resumed_run_keeps_the_learning_rates_of_its_first_gaussians(tmp_path)
     [
         lambda tensors, progress: progress.clear(),
         lambda tensors, progress: tensors.clear(),
-        lambda tensors, progress: progress.update(step=[1], resolution=3),
+        lambda tensors, progress: progress.update(step=[1]),
+        lambda tensors, progress: progress.update(step=41),
+        lambda tensors, progress: progress.update(resolution=3),
+        lambda tensors, progress: progress.update(records=3),
+        lambda tensors, progress: progress.update(elapsed="x"),
+        lambda tensors, progress: progress.update(elapsed=float("nan")),
         lambda tensors, progress: tensors.update({"model.gaussians.positions": torch.zeros(3, 2)}),
         lambda tensors, progress: tensors.update({"model.geometry.grid.table": None}),
     ],
@@ -349,6 +354,18 @@ def test_a_checkpoint_with_missing_or_wrong_values_is_a_clear_error(damage, tmp_
     save_checkpoint(path, settings=trainer._settings(), tensors=tensors, progress=progress)
     with pytest.raises(HyrfTrainingError, match="the checkpoint is damaged"):
         Trainer(make_scene(), SHORT_CONFIG).load(path)
+
+
+def test_running_out_of_memory_on_resume_does_not_blame_the_checkpoint(tmp_path, monkeypatch):
+    path, trainer = tmp_path / "c.pt", Trainer(make_scene(), SHORT_CONFIG)
+    trainer.save(path)
+
+    def fail(*_):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(trainer, "_restore", fail)
+    with pytest.raises(HyrfError, match="the GPU's memory ran out"):
+        trainer.load(path)
 
 
 def test_random_backgrounds_resume_too(tmp_path):

@@ -211,7 +211,7 @@ def _bin_pairs(order: np.ndarray, projection: Projection, view: _View) -> _Tiles
             raise _too_many_pairs()
         chunk_pairs[chunk] = cpu_bin.find_pairs(
             edges[chunk], edges[chunk + 1], order, projection.tile_count_bounds, records, width, height,
-            tile_counts[chunk], slot_starts[1:], sorted_records,
+            cpu_bin.MAX_PAIRS, tile_counts[chunk], slot_starts[1:], sorted_records,
         )  # fmt: skip
         pair_count += len(chunk_pairs[chunk][0])
 

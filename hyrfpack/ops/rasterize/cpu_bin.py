@@ -103,12 +103,15 @@ def _pixel_range(low, high, last):
 
 
 @_kernel
-def find_pairs(start, stop, order, tile_count_bounds, records, width, height, tile_counts, pair_counts, sorted_records):
+def find_pairs(
+    start, stop, order, tile_count_bounds, records, width, height, max_pairs, tile_counts, pair_counts, sorted_records
+):  # fmt: skip
     """List the tiles that each Gaussian touches, for positions start to stop of the depth order.
 
     A pair is listed if the ellipse alpha >= 1/255 meets the rectangle spanned by the tile's pixel centres.
 
     Args:
+        max_pairs: the search ends after so many pairs.
         tile_counts: (tiles,) number of pairs in each tile; incremented.
         pair_counts: (N,) number of pairs of each Gaussian; written for Gaussians in `order`.
         sorted_records: (V, 16) the records in depth order; written.
@@ -120,7 +123,7 @@ def find_pairs(start, stop, order, tile_count_bounds, records, width, height, ti
     capacity = 0
     for position in range(np.uint64(start), np.uint64(stop)):
         capacity += np.int64(tile_count_bounds[order[position]])
-    capacity = min(capacity, MAX_PAIRS)  # With so many pairs, the view is not drawn.
+    capacity = min(capacity, max_pairs)
     tiles, rows = np.empty(capacity, np.uint32), np.empty(capacity, np.uint8)
     tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE
     at = 0
