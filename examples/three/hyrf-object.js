@@ -2,7 +2,7 @@
 // the page's thread only uploads arrays.
 
 import { Vector3 } from "three";
-import { CULL_MARGIN_RATIO, NEAR_PLANE_LOCAL } from "hyrf.js/frustum.js";
+import { CULL_MARGIN_RATIO } from "hyrf.js/frustum.js";
 import { viewFromPlace } from "hyrf.js/places.js";
 
 import { GaussianPass } from "./gaussian-pass.js";
@@ -17,7 +17,7 @@ export class HyrfObject extends RemoteObject {
     super(model);
     this.shapeView = {
       ...this.view, u_depth: { value: new Vector3() },
-      u_near: { value: NEAR_PLANE_LOCAL }, u_margin: { value: CULL_MARGIN_RATIO },
+      u_near: { value: this.nearPlane }, u_margin: { value: CULL_MARGIN_RATIO },
       u_antialiased: { value: model.config.antialiased },
     };
     this.gaussians = new GaussianPass(model.rowCount, this.shapeView);

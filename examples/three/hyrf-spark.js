@@ -96,8 +96,12 @@ export class HyrfSplats extends RemoteObject {
   }
 }
 
-// Returns the displayed value of a colour, from 0 to 1, with a gain.
-const exposed = (value, gain) => (gain * value) / (1 + (gain - 1) * value);
+// Returns the displayed value of a colour with a gain, where a value above 1 is white. A gain of 1 changes nothing.
+function exposed(value, gain) {
+  if (gain === 1) return value;
+  const shown = Math.min(value, 1);
+  return (gain * shown) / (1 + (gain - 1) * shown);
+}
 
 // Returns the length in local units that a pixel of a view covers at a place; 0 for places behind the camera.
 function depthPerPixel({ rows, translation, fx, fy }, { x, y, z }) {

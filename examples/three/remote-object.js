@@ -58,7 +58,9 @@ export class RemoteObject extends Object3D {
     this.exposureMode = AS_PHOTOGRAPHED;
     const { metadata, config, count, exposure } = model, { scale } = config.frame;
     const { cameras, up, target } = viewpointOf(metadata);
-    const near = NEAR_PLANE_LOCAL * scale, far = 2.5 * BACKGROUND_RADIUS * scale;
+    // That of the part with the smallest unit, in local units; the worker omits what is nearer than a part's own one.
+    this.nearPlane = NEAR_PLANE_LOCAL * Math.min(...model.parts.map(({ place }) => place.scale));
+    const near = this.nearPlane * scale, far = 2.5 * BACKGROUND_RADIUS * scale;
     const solid = config.background ? null : config.solid;
     this.userData.hyrf = { metadata, count, exposure, cameras, up, target, near, far, solid };
     this.quaternion.copy(upright(up));

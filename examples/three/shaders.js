@@ -10,9 +10,11 @@ uniform vec4 u_intrinsics; // fx, fy, cx, cy in pixels
 uniform vec2 u_size; // of the picture in pixels
 `;
 
-// Applies the gains of an exposure to a displayed colour. Gains of 1 change nothing.
+// Applies the gains of an exposure to a displayed colour, of which what exceeds 1 is white. Gains of 1 change nothing.
 const EXPOSE = `
 vec3 expose(vec3 color, vec3 gains) {
+    if (gains == vec3(1.0)) return color;
+    color = clamp(color, 0.0, 1.0);
     return gains * color / (1.0 + (gains - 1.0) * color);
 }
 `;
@@ -182,7 +184,7 @@ void main() {
     if (u_gains != vec3(1.0)) {
         vec3 behind = u_has_sky ? sky(pixel) : color;
         float passed = 1.0 - blended.a;
-        color = (expose(clamp(blended.rgb + passed * behind, 0.0, 1.0), u_gains) - passed * expose(behind, u_gains)) / blended.a;
+        color = (expose(blended.rgb + passed * behind, u_gains) - passed * expose(behind, u_gains)) / blended.a;
     }
     gl_FragColor = vec4(clamp(color, 0.0, 1.0), blended.a);
     ${OUTPUT}

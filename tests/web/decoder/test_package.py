@@ -35,6 +35,7 @@ PUBLIC_MODULES = (
     "row_states",
     "sampling",
     "sort",
+    "view_evaluator",
     "viewpoint",
 )
 
@@ -64,6 +65,14 @@ def test_the_package_has_the_version_and_license_of_hyrfpack():
     assert package["version"] == hyrfpack.__version__
     assert package["license"] == "Apache-2.0"
     assert (PACKAGE_FOLDER / "LICENSE").read_bytes() == (PROJECT_FOLDER / "LICENSE").read_bytes()
+
+
+def test_examples_import_only_exported_modules():
+    exports = json.loads((PACKAGE_FOLDER / "package.json").read_text())["exports"]
+    codes = [path.read_text() for path in (PROJECT_FOLDER / "examples" / "three").glob("*.js")]
+
+    imported = {name for code in codes for name in re.findall(r'from "hyrf\.js/([\w.]+)"', code)}
+    assert imported and {f"./{name}" for name in imported} <= exports.keys()
 
 
 def test_public_modules_are_exported():

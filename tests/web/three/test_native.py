@@ -241,6 +241,36 @@ def test_pictures_of_a_merged_file_are_those_of_all_its_parts(exposed, least_psn
 
 
 @pytest.mark.acceptance
+def test_near_gaussians_of_a_part_with_a_smaller_unit_are_drawn(page: Chromium, app_folder: Path):
+    shutil.copy(GOLDEN_FILE, app_folder / "tiny.hyrf")
+    parts = [app_folder / "golden.hyrf", app_folder / "tiny.hyrf"]
+    merge_models(parts, app_folder / "small.hyrf", {"tiny": [Scale(0.001)]})
+    scene, part = hyrfpack.load_merged_model(app_folder / "small.hyrf").parts
+    page.evaluate("page.load('small.hyrf')")
+    nearest = page.evaluate("[page.object.userData.hyrf.near, page.object.shapeView.u_near.value]")
+    ratio = part.config.frame.scale / scene.config.frame.scale
+    assert ratio < 1 and nearest == pytest.approx([0.01 * part.config.frame.scale, 0.01 * ratio])
+
+
+@pytest.mark.acceptance
+def test_colors_above_1_are_white_where_the_exposure_darkens(page: Chromium, app_folder: Path):
+    toy, provenance = load_with_provenance(GOLDEN_FILE)
+    toy.exposure = visible_map()
+    hyrfpack.save_model(toy, app_folder / "dark.hyrf", provenance=provenance)
+    merge_models([app_folder / "golden.hyrf", app_folder / "dark.hyrf"], app_folder / "bright.hyrf")
+    page.evaluate(
+        "(({ prototype }) => { const { receiveRow } = prototype; prototype.receiveRow = function (row) {"
+        " row.colors = row.colors.map((value, k) => (k % 4 === 3 ? value : 3)); receiveRow.call(this, row); };"
+        " prototype.gains = () => [0.3, 0.3, 0.3]; })(page.Kind)"
+    )
+    page.evaluate("page.load('bright.hyrf')")
+    camera = first_camera(page)
+    merged = hyrfpack.load_merged_model(app_folder / "bright.hyrf")
+    opaque = render_view(merged, camera, EXACT_SETTINGS).alpha.numpy() > 0.999
+    assert opaque.mean() > 0.01 and draw(page, camera)[opaque].min() > 250
+
+
+@pytest.mark.acceptance
 def test_a_turned_moved_and_scaled_object_looks_the_same_from_the_same_place(page: Chromium):
     page.evaluate("page.load('balls.hyrf')")
     camera = first_camera(page)
