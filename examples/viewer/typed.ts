@@ -24,4 +24,7 @@ async function save(): Promise<void> {
   viewer.destroy();
 }
 
-document.querySelector("hyrf-viewer")?.addEventListener("click", save);
+const element = document.querySelector("hyrf-viewer");
+element?.addEventListener("click", save);
+element?.addEventListener("error", ({ detail }) => console.error(detail.trim()));
+element?.addEventListener("camera", ({ detail }) => console.log(detail.camera_from_world));

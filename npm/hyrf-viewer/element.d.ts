@@ -8,6 +8,27 @@ export interface HyrfViewerElement extends HTMLElement {
    * that left the window may lose theirs, and get a new one when they come back. The event `load` reports it.
    */
   readonly viewer: Viewer | null;
+
+  addEventListener<Name extends keyof ElementEvents>(
+    type: Name,
+    listener: (this: HyrfViewerElement, event: ElementEvents[Name]) => unknown,
+    options?: boolean | AddEventListenerOptions,
+  ): void;
+  addEventListener(
+    type: string,
+    listener: EventListenerOrEventListenerObject,
+    options?: boolean | AddEventListenerOptions,
+  ): void;
+  removeEventListener<Name extends keyof ElementEvents>(
+    type: Name,
+    listener: (this: HyrfViewerElement, event: ElementEvents[Name]) => unknown,
+    options?: boolean | EventListenerOptions,
+  ): void;
+  removeEventListener(
+    type: string,
+    listener: EventListenerOrEventListenerObject,
+    options?: boolean | EventListenerOptions,
+  ): void;
 }
 
 /** Events of the element. With the attribute `frame` it fires only `load` and `error`. */
@@ -21,6 +42,8 @@ export interface HyrfViewerEventMap {
   /** The picture was drawn from another viewpoint. */
   camera: CustomEvent<Camera>;
 }
+
+interface ElementEvents extends Omit<HTMLElementEventMap, keyof HyrfViewerEventMap>, HyrfViewerEventMap {}
 
 declare global {
   interface HTMLElementTagNameMap {

@@ -23,7 +23,10 @@ export type CameraName = number | string | Camera;
 /** "as-photographed" has the exposure of the photos taken near the viewpoint, "consistent" one exposure everywhere. */
 export type Exposure = "as-photographed" | "consistent";
 
-/** A `.hyrf`, `.ply`, `.spz`, `.splat` or `.sog` file: its address, or its content. */
+/**
+ * A `.hyrf`, `.ply`, `.spz`, `.splat` or `.sog` file: its address, or its content. Or the address of the `scene.json`
+ * of a scene folder.
+ */
 export type Source = string | URL | Blob | ArrayBuffer | ArrayBufferView | ReadableStream<Uint8Array>;
 
 /** What draws scenes: the value `webgpu` of "hyrf-viewer/webgpu". It has no use but the option `renderer`. */
