@@ -246,7 +246,7 @@ def test_a_box_is_drawn_and_applied_about_the_up_direction_before_it(browser: Br
 def test_typed_degrees_are_wrapped_to_half_a_turn(browser: Browser, tmp_path: Path):
     load_editable_page(browser, tmp_path, make_editable_page(make_model(50)))
     click(browser, "#edit-add-box")
-    for typed, degrees in ((270, -90), (180, 180), (-190.5, 169.5)):
+    for typed, degrees in ((270, -90), (180, 180), (-190.5, 169.5), (-179.97, 180)):
         fill(browser, "#edit-turn", typed)
         assert list_actions(browser)[-1]["value"][6] == degrees
 

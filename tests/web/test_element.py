@@ -177,6 +177,35 @@ def test_a_lazy_frame_is_loaded_when_it_comes_near_the_window(browser: Browser, 
     wait_until(browser, LOADED_JS)
 
 
+def test_a_lazy_frame_waits_until_its_attribute_changes_and_begins_at_the_newest_camera(browser: Browser, host: Site):
+    host.files["/post.html"] = PAGE.format(
+        body='<div style="height: 30000px"></div>'
+        '<hyrf-viewer src="cloud.spz" camera="0,0,3,0,0,0,0,1,0" frame loading="lazy"></hyrf-viewer>'
+    ).encode()
+    browser.open(f"{host.address}/post.html")
+    frame = f"{ELEMENT_JS}.shadowRoot.querySelector('iframe')"
+    wait_until(browser, f"Boolean({frame})")
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('camera', '1,0,3,0,0,0,0,1,0')")
+    browser.evaluate("new Promise((done) => setTimeout(done, 300))")
+    assert not any(path.startswith("/index.html") for path, _ in host.requests)
+    entries = browser.evaluate("history.length")
+    browser.evaluate(f"{ELEMENT_JS}.removeAttribute('loading')")
+    wait_until(browser, LOADED_JS)
+    assert browser.evaluate(f"{frame}.contentWindow.location.hash").startswith("#camera=1,")
+    assert browser.evaluate("history.length") == entries
+
+
+def test_a_frame_whose_worker_fails_fires_an_error(browser: Browser, host: Site):
+    open_element(browser, host, 'src="cloud.spz" frame')
+    wait_until(browser, LOADED_JS)
+    worker = "contentWindow.hyrfpack.player.loader.connection.shared.worker"
+    browser.evaluate(
+        f"{ELEMENT_JS}.shadowRoot.querySelector('iframe').{worker}"
+        ".dispatchEvent(new ErrorEvent('error', { message: 'no memory' }))"
+    )
+    wait_until(browser, "fired.some(([name, detail]) => name === 'error' && detail.includes('no memory'))")
+
+
 def test_a_frame_follows_the_camera_without_entries_in_the_history(browser: Browser, host: Site):
     open_element(browser, host, 'src="cloud.spz" camera="0,0,3,0,0,0,0,1,0" frame')
     wait_until(browser, LOADED_JS)

@@ -232,6 +232,59 @@ def test_an_order_that_a_failed_worker_owes_is_null(browser: Browser, host: Site
     assert order is None and "no memory" in answer
 
 
+def test_replies_of_a_failed_worker_are_ignored(browser: Browser, host: Site):
+    browser.open(f"{host.address}/index.html?content=cloud.spz")
+    browser.evaluate("hyrfpack.ready.then(() => hyrfpack.player.settled)")
+    expression = (
+        "(({ loader, scene }, view) => { const { number, shared: { worker } } = loader.connection,"
+        " sort = () => loader.sort(view, scene),"
+        " ask = () => loader.ask({ select: [] }).catch(({ message }) => message),"
+        " send = (message) => worker.onmessage({ data: { reader: number, ...message } }), pending = [sort(), ask()],"
+        " tickets = [...loader.waiting.keys(), ...loader.asked.keys()];"
+        " send({ failure: 'no memory' });"
+        " send({ order: { ticket: tickets[0] } });"
+        " send({ answer: { ticket: tickets[1] } });"
+        " send({ content: {} });"
+        " return Promise.all([...pending, sort(), ask()]).then((ends) => [...ends, loader.busy]);"
+        " })(hyrfpack.player, hyrfpack.player.view())"
+    )
+    order, answer, later_order, later_answer, busy = browser.evaluate(expression)
+    assert order is None and later_order is None and not busy
+    assert "no memory" in answer and later_answer == answer
+    assert browser.list_errors() == []
+
+
+FAIL_JS = "dispatchEvent(new ErrorEvent('error', { message: 'no memory' }))"
+
+
+def test_after_a_failure_of_the_worker_the_error_of_another_file_is_reported(browser: Browser, host: Site):
+    browser.open(f"{host.address}/index.html?content=some scene.hyrf")
+    browser.evaluate("hyrfpack.ready.then(() => hyrfpack.player.settled)")
+    browser.evaluate(f"hyrfpack.player.loader.connection.shared.worker.{FAIL_JS}")
+    wait_for_message(browser)
+    drop_file(browser, b"not a scene", "notes.txt")
+    wait_until(browser, "document.getElementById('sentence').textContent.startsWith('notes.txt')")
+    message = wait_for_message(browser)
+    for promise in ("settled", "show(hyrfpack.camera())"):
+        answer = browser.evaluate(f"hyrfpack.player.{promise}.then(() => '', ({{ message }}) => message)")
+        assert answer and message == f"notes.txt cannot be opened: {answer}", promise
+    browser.evaluate("document.getElementById('views').click()")  # the strip waits for no picture
+    assert browser.evaluate("document.getElementById('strip').hidden") is False
+
+
+def test_a_scene_whose_worker_fails_while_it_is_prepared_is_not_shown(browser: Browser, host: Site):
+    browser.open(f"{host.address}/index.html?content=cloud.spz")
+    browser.evaluate("hyrfpack.ready.then(() => hyrfpack.player.settled)")
+    browser.evaluate("void (hyrfpack.player.renderer.prepare = () => new Promise((go) => (window.go = go)))")
+    drop_file(browser, host.files["/some scene.hyrf"], "other.hyrf")
+    wait_until(browser, "Boolean(window.go)")
+    browser.evaluate(f"hyrfpack.player.next.connection.shared.worker.{FAIL_JS}")
+    message = wait_for_message(browser)
+    assert message.startswith("other.hyrf cannot be opened: The player's worker has failed (no memory)")
+    browser.evaluate("(go(), new Promise((done) => setTimeout(done, 300)))")
+    assert browser.evaluate("hyrfpack.player.scene.kind") == "splats" and wait_for_message(browser) == message
+
+
 # ---- progress
 
 

@@ -59,6 +59,18 @@ def test_a_viewer_draws_what_render_draws_from_the_same_camera(browser: Browser,
     assert browser.list_errors() == []
 
 
+def test_a_viewer_whose_worker_fails_is_not_ready_and_takes_no_screenshot(browser: Browser, site: Site):
+    open_viewer(browser, site)
+    wait_until(browser, READY_JS)
+    browser.evaluate("viewer.screenshot().then(() => viewer.on('error', ({ error }) => (window.failure = error)), 0)")
+    browser.evaluate(
+        "viewer.player.loader.connection.shared.worker.dispatchEvent(new ErrorEvent('error', { message: 'no memory' }))"
+    )
+    assert "no memory" in browser.evaluate("failure.message") and not browser.evaluate(READY_JS)
+    assert error_of(browser, "viewer.screenshot()") == browser.evaluate("failure.message")
+    assert "gone.hyrf" in error_of(browser, "viewer.load('gone.hyrf')") and not browser.evaluate(READY_JS)
+
+
 def test_events_report_progress_that_never_falls_then_ready_with_the_scene(browser: Browser, site: Site):
     script = (
         CREATE_JS + "window.parts = []; viewer.on('progress', ({ progress }) => parts.push(progress));"

@@ -102,7 +102,7 @@ export const describe = (bytes) => {
  *   layers that are complete; `openFile`: called for the file that a chunk of a scene folder refers to
  * @returns {Promise<Model>} the fields and the exposure map of a chunk are those of the other file
  * @throws {HyrfFormatError} the file is damaged, truncated or too new; `bytes` has no complete layer; the file is a
- *   merged one; or it refers to a file that is damaged or another one, or that cannot be opened
+ *   merged one; or it refers to a file that is damaged or another one, or that cannot be opened, as without `openFile`
  */
 export const read = async (bytes, { partial = false, openFile } = {}) => {
   const container = new Container(bytes, partial), name = sharedFileName(container);
@@ -234,7 +234,7 @@ const sourceOf = (container, type) => {
   if (!container.has(type)) rejectIncomplete(container, requireEntry(container, type).end);
   if (container.shared) return container.shared;
   const name = sharedFileName(container);
-  throw new HyrfFormatError(`The file needs ${name}; open scene.json of its folder, or call read with openFile.`);
+  throw new HyrfFormatError(`The file needs ${name}; open scene.json of its folder.`);
 };
 
 /**

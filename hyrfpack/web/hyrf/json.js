@@ -3,7 +3,7 @@
 
 import { DamagedData, assertValid } from "./errors.js";
 
-const MAX_NESTING_DEPTH = 64;
+export const MAX_NESTING_DEPTH = 64;
 const MAX_INTEGER_DIGITS = 4300;
 const NUMBER_PATTERN = /-?(?:0|[1-9]\d*)(\.\d+)?([eE][+-]?\d+)?/y;
 /** @type {[string, boolean | null][]} */

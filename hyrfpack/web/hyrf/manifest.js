@@ -3,6 +3,7 @@
 
 import { MAX_PARTS } from "./container.js";
 import { DamagedData, HyrfFormatError, assertValid, groupedDigits, quotedText } from "./errors.js";
+import { MAX_NESTING_DEPTH } from "./json.js";
 import { MAX_QUAT_LENGTH_ERROR } from "./metadata.js";
 import { CONTROL_CHARACTERS, arePartNames } from "./parts.js";
 import { IDENTITY_QUAT } from "./rotation.js";
@@ -55,6 +56,7 @@ export const parseManifest = (bytes) => {
     if (values?.format !== FORMAT_NAME) {
       throw new HyrfFormatError("This is not the manifest of a scene folder; check the address.");
     }
+    assertValid(!isTooDeep(values, MAX_NESTING_DEPTH), `it is nested deeper than ${MAX_NESTING_DEPTH} levels`);
     const isOne = readMajorVersion(values.version) < PARTS_VERSION;
     const manifest = isOne ? { ...values, ...onePart(values) } : values;
     checkManifest(manifest, isOne ? 1 : 2);
@@ -76,6 +78,15 @@ const parseText = (bytes) => {
     throw new DamagedData("it is not JSON");
   }
 };
+
+/**
+ * Returns whether objects and lists are nested deeper than a number of levels.
+ * @param {any} value
+ * @param {number} levels
+ * @returns {boolean}
+ */
+const isTooDeep = (value, levels) =>
+  Object(value) === value && (levels === 0 || Object.values(value).some((inner) => isTooDeep(inner, levels - 1)));
 
 /** @param {any} version */
 const readMajorVersion = (version) => {

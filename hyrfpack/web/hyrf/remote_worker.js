@@ -106,7 +106,7 @@ async function fetchBytes(address) {
     reported = performance.now();
     post({ progress: { step: "loading", part: Math.min(1, received / length) } });
   }
-  reader.cancel();
+  reader.cancel().catch(() => {}); // the connection may be lost meanwhile
   return joinBytes(parts, received);
 }
 

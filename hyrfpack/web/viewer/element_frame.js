@@ -52,23 +52,34 @@ export class FrameView {
     }
     if (element.hasAttribute("camera")) address.hash = `camera=${element.getAttribute("camera")}`;
     this.show(address);
+    this.frame.loading = this.loading;
     this.frame.title = element.title || "3D scene";
+  }
+
+  get loading() {
+    return this.element.getAttribute("loading") ?? "eager";
   }
 
   // Shows an address. A new camera changes only what follows "#", so the frame is not reloaded. It replaces the last
   // one, and another scene is shown in a new frame, because a new `src` would add an entry to the browser's history.
+  // Before the frame is loaded, a new `src` adds none, and a lazy frame goes on waiting.
   show({ href, hash }) {
     const before = this.address;
     this.address = href;
     if (href === before) return;
-    if (hash && withoutHash(href) === withoutHash(before)) return this.replaceAddress();
+    if (hash && withoutHash(href) === withoutHash(before)) {
+      if (this.isLoaded) this.replaceAddress();
+      else this.frame.src = href;
+      return;
+    }
     this.removeFrame();
-    this.isAnswered = false;
+    this.isAnswered = this.isLoaded = false;
     this.frame = document.createElement("iframe");
     this.frame.allow = "fullscreen; clipboard-write; web-share";
-    this.frame.loading = this.element.getAttribute("loading") ?? "eager";
+    this.frame.loading = this.loading; // before it has an address
     this.frame.src = href;
     this.frame.onload = () => {
+      this.isLoaded = true;
       if (this.isMoved && this.frame.src !== this.address) this.replaceAddress(); // with that of the newest camera
       this.isMoved = false;
       if (!this.isAnswered) this.timer = setTimeout(() => this.fail(this.noPlayerText()), ANSWER_MS);

@@ -29,7 +29,7 @@ export class Loader {
     this.asked = new Map(); // ticket -> {resolve, reject} of the promise of its answer
     this.spare = null; // the array of an old order, for reuse
     const refusal = workerAddress
-      ? `The player's worker ${workerAddress} cannot be started; it must be a script on the same site as the page.`
+      ? `The player's worker ${workerAddress} cannot be started; it must be a script on the page's site.`
       : NO_EMBEDDED_WORKER_TEXT;
     const receive = (message) => this.receive(message);
     // An error without a message means that the worker's script was not allowed to run.
@@ -86,6 +86,7 @@ export class Loader {
   breakDown(error) {
     const isReported = this.pending.length + this.asked.size > 0;
     this.failure = error;
+    this.connection.close(); // nothing waits for what the worker still sends
     this.end(error);
     this.failed(error, isReported);
   }
@@ -153,7 +154,7 @@ export class Loader {
     const ticket = ++this.ticket, order = this.spare;
     this.spare = null;
     this.connection.post({ sort: { ticket, row, sides, near: sortNear, order } }, order ? [order.buffer] : []);
-    return new Promise((resolve) => this.waiting.set(ticket, resolve));
+    return this.failure ? null : new Promise((resolve) => this.waiting.set(ticket, resolve));
   }
 
   sorted(answer) {

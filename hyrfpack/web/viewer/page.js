@@ -56,6 +56,12 @@ function showRing(x, y) {
   ring.onanimationend = () => (ring.hidden = true);
 }
 
+// Shows an error, also to the page around this one.
+function report(error) {
+  fail(error);
+  postToParent("error", error.message);
+}
+
 // Fills the screen with the page, or ends that; a browser may refuse it.
 function toggleFullscreen() {
   const page = document.documentElement;
@@ -162,22 +168,23 @@ function start({ startEditing = () => {}, streaming = null, watchTraining }) {
 
   // ---- events of the player
 
-  player.addEventListener("progress", ({ detail }) => progress(detail.part));
-  player.addEventListener("remark", ({ detail }) => remark(detail));
-  player.addEventListener("failed", ({ detail }) => fail(detail));
-  player.addEventListener("camera", ({ detail }) => {
-    if (player.loaded) announce(`Camera ${detail + 1} of ${player.cameras.length}`);
+  const on = (event, listener) => player.addEventListener(event, ({ detail }) => listener(detail));
+  on("progress", ({ part }) => progress(part));
+  on("remark", remark);
+  on("failed", report);
+  on("camera", (number) => {
+    if (player.loaded) announce(`Camera ${number + 1} of ${player.cameras.length}`);
   });
-  player.addEventListener("opened", ({ detail }) => {
+  on("opened", (scene) => {
     navigation.stop();
     opener.shown = player.loader.origin ?? opener.shown;
-    if (detail.isStreamed && !opener.shown.isNamed) opener.shown.title = detail.title; // the manifest has it
-    panel.describe(detail, opener.shown.title);
+    if (scene.isStreamed && !opener.shown.isNamed) opener.shown.title = scene.title; // the manifest has it
+    panel.describe(scene, opener.shown.title);
     element("credit").hidden = !(opener.shown.isOwn && isCredited);
     if (opener.shown.isOwn) followNamedCamera();
   });
-  player.addEventListener("count", ({ detail }) => panel.setTitle(detail, opener.shown.title));
-  player.addEventListener("loaded", () => {
+  on("count", (scene) => panel.setTitle(scene, opener.shown.title));
+  on("loaded", () => {
     document.body.classList.remove("empty"); // the page's own scene may be loaded after a file failed
     revealCanvas(player, poster);
     help.greet();
@@ -216,10 +223,7 @@ function start({ startEditing = () => {}, streaming = null, watchTraining }) {
   }
   element("credit").hidden = !isCredited;
   const ready = opener.openFirst(Boolean(embedded), served, parameters);
-  ready.catch((error) => {
-    fail(error);
-    postToParent("error", error.message);
-  });
+  ready.catch(report);
   if (parameters.wrong.length) fail({ message: parameters.wrong.join(" ") });
 
   // The interface for scripts. Cameras are {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4}, with OpenCV axes;
@@ -246,7 +250,6 @@ export function startPage(options = {}) {
     start(options);
   } catch (error) {
     document.body.classList.add("bare"); // hides the controls, which would have no effect
-    fail(error);
-    postToParent("error", error.message);
+    report(error);
   }
 }

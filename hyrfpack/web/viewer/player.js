@@ -34,7 +34,7 @@ const MAX_STEP_SECONDS = 0.25; // limits the movement of the eye after a long fr
 const COLORING_RATIO = 0.25; // the share of a frame that is used for colours while moving
 const PROGRESS_RANGES = { loading: [0, 0.3], unpacking: [0.3, 0.6], preparing: [0.6, 1] };
 
-const DEVICE_LOST_TEXT = "Meanwhile the graphics device was lost, or another scene opened; try again.";
+const DEVICE_LOST_TEXT = "The graphics device was lost, or another scene was opened; try again.";
 const NO_PICTURE_TEXT = "The picture is too large for this browser; try again in a smaller window.";
 const NOT_READY_TEXT = "The scene is not ready for exact pictures yet; wait until it is loaded.";
 const DISPOSED_TEXT = "The player was disposed of.";
@@ -178,7 +178,7 @@ export class Player extends EventTarget {
       } else {
         this.discard(loader);
       }
-      if (!this.loader) this.giveUp(error);
+      if (!this.loader || this.loader.failure) this.giveUp(error);
       throw error;
     }
   }
@@ -193,7 +193,7 @@ export class Player extends EventTarget {
   // Stops to draw a file whose worker has failed. What the canvas shows stays there.
   breakDown(loader, error, isReported) {
     if (loader === this.loader) {
-      this.loaded = false;
+      this.loaded = this.idle = false;
       this.giveUp(error);
     }
     if (!isReported) this.emit("failed", error);
@@ -214,12 +214,13 @@ export class Player extends EventTarget {
     if (loader === (this.next ?? this.loader) && !loader.update) this.emit("progress", { what, part: loader.part });
   }
 
-  // Returns whether the player still uses a loader.
+  // Returns whether the player still uses a loader, whose worker has not failed.
   wanted(loader) {
-    return [this.loader, this.next, this.previous].includes(loader);
+    return !loader.failure && [this.loader, this.next, this.previous].includes(loader);
   }
 
-  // Waits until a loader may show its content. Throws SupersededError if the player no longer uses it.
+  // Waits until a loader may show its content. Throws SupersededError if the player no longer uses it, also after a
+  // failure of its worker, which `breakDown` has reported.
   async waitFor(loader) {
     while (loader === this.previous) await new Promise((resolve) => this.waiters.push(resolve));
     if (!this.wanted(loader)) throw new SupersededError();
@@ -638,9 +639,9 @@ export class Player extends EventTarget {
 
   // Moves the eye to one of the scene's cameras.
   choose(number) {
-    this.camera = (number + this.cameras.length) % this.cameras.length;
-    this.eye.setView(this.cameras[this.camera]);
-    this.emit("camera", this.camera);
+    this.camera = number;
+    this.eye.setView(this.cameras[number]);
+    this.emit("camera", number);
     this.changed();
   }
 
@@ -679,7 +680,9 @@ export class Player extends EventTarget {
   // Sorts a content for a view, for a picture that is drawn at once. Throws ContextLostError if that is impossible.
   async sortFor(view, content = this.renderer.content) {
     const sorted = this.loaded ? await this.findOrder(view) : null;
-    if (!sorted || !this.loaded || content !== this.renderer.content) throw new ContextLostError(DEVICE_LOST_TEXT);
+    if (!sorted || !this.loaded || content !== this.renderer.content) {
+      throw this.failure ?? new ContextLostError(DEVICE_LOST_TEXT);
+    }
     this.setOrder(sorted);
   }
 
@@ -714,9 +717,9 @@ export class Player extends EventTarget {
       await this.sortFor(view, content);
       const options = { exact: true, blend: (seen) => this.renderer.blended(seen) };
       const isExact = await content.complete(view, this.scene.tolerance, options);
-      if (!isExact) throw new Error(NOT_READY_TEXT); // the content is an estimate
       await this.renderer.graphics.whenDone(); // for `read`
       await this.sortFor(view, content); // meanwhile frames of the window may have got another order
+      if (!isExact) throw new Error(NOT_READY_TEXT); // the content is an estimate
       return this.renderer.read(view, this.exposureOf(view));
     };
     const picture = await this.enqueue(() => {

@@ -94,7 +94,13 @@ class Viewer {
       this.progress = detail.part;
       this.emit("progress", { progress: detail.part });
     });
-    player.addEventListener("failed", ({ detail }) => this.emit("error", { error: detail }));
+    player.addEventListener("failed", ({ detail }) => {
+      if (!player.loaded) {
+        this.isReady = false;
+        this.readyLoader = null;
+      }
+      this.emit("error", { error: detail });
+    });
     player.addEventListener("moved", () => this.emit("camera", {}));
     player.addEventListener("opened", () => {
       this.navigation.stop();
@@ -216,7 +222,8 @@ class Viewer {
   }
 
   async screenshot({ type = "image/png", quality } = {}) {
-    if (!this.player.loaded) throw new Error("The viewer has no scene yet; wait for 'ready'.");
+    const { loaded, failure } = this.player;
+    if (!loaded) throw failure ?? new Error("The viewer has no scene yet; wait for 'ready'.");
     this.screenshots++;
     this.applyPause();
     try {

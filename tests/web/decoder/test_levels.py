@@ -28,8 +28,10 @@ FRAME = {"center": [0, 0, 0], "scale": 1, "half_extent": [1, 1, 1]}
 ROTATED = with_value(["frame", "rotation"], [0.6, 0, -0.8, 0])
 INTEGRAL_FLOATS = VALID_MANIFEST.to_json().replace(b'"bytes":1000,', b'"bytes":1000.0,')
 NESTED_NAME = VALID_MANIFEST.to_json().replace(b'"shared.hyrf"', b"[" * 20_000 + b"]" * 20_000)
+VIEWPOINTS = {depth: json.loads("[" * depth + "]" * depth) for depth in (62, 63)}  # below the manifest and 'viewpoint'
 BAD_MANIFESTS = [
     NESTED_NAME,
+    with_value(["viewpoint"], {"a": VIEWPOINTS[63]}),
     b"",
     b"[]",
     b"{}",
@@ -217,6 +219,7 @@ def test_manifests_are_accepted_and_refused_as_in_python(tmp_path: Path):
         LATER_VERSION,
         INTEGRAL_FLOATS,
         ROTATED,
+        with_value(["viewpoint"], {"a": VIEWPOINTS[62]}),
         *titles,
         *golden,
     ]

@@ -61,7 +61,7 @@ export declare const describe: (bytes: Uint8Array) => Description;
  *   layers that are complete; `openFile`: called for the file that a chunk of a scene folder refers to
  * @returns {Promise<Model>} the fields and the exposure map of a chunk are those of the other file
  * @throws {HyrfFormatError} the file is damaged, truncated or too new; `bytes` has no complete layer; the file is a
- *   merged one; or it refers to a file that is damaged or another one, or that cannot be opened
+ *   merged one; or it refers to a file that is damaged or another one, or that cannot be opened, as without `openFile`
  */
 export declare const read: (bytes: Uint8Array, { partial, openFile }?: {
     partial?: boolean;

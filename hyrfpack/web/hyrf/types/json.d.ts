@@ -1,3 +1,4 @@
+export declare const MAX_NESTING_DEPTH = 64;
 /** A number as float64, and whether its text is an integer. */
 export declare class JsonNumber {
     value: number;

@@ -8,7 +8,6 @@ import { dropAction, findActive, putAction, statedUp } from "./actions.js";
 import { CropBox } from "./crop_box.js";
 
 const OPTION = "crop-box";
-const DEGREE_DIGITS = 1;
 const FIRST_SIDE_RATIO = 0.3; // half the sides of a new box, of the cameras' distance from the scene's target
 
 export class CropTool {
@@ -66,9 +65,10 @@ export class CropTool {
   put(change, isFinal = true) {
     const { editor, active, before } = this;
     if (!active) return;
-    const { value, isInverted } = { ...active, ...change }, turned = value[6] ?? 0;
+    const { value, isInverted } = { ...active, ...change };
     const rounded = value.slice(0, 6).map((place) => roundLength(place, editor.size));
-    const degrees = Number((turned + 360 * Math.round(-turned / 360)).toFixed(DEGREE_DIGITS)); // over -180, to 180
+    const tenths = Math.round(10 * (value[6] ?? 0));
+    const degrees = (tenths + 3600 * Math.round(-tenths / 3600)) / 10; // over -180, to 180
     if (degrees) rounded.push(degrees);
     const action = { option: OPTION, value: rounded, ...(isInverted && { isInverted }) };
     let { actions } = editor;

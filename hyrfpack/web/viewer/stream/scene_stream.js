@@ -25,6 +25,7 @@
 //                                            ticket: the Gaussians drawn and in memory, the bytes received and of the
 //                                            scene, the predicted PSNR in dB; `problem` is a sentence
 
+import { explainMemory } from "../../hyrf/errors.js";
 import { parseManifest } from "../../hyrf/manifest.js";
 import { movePositions } from "../../hyrf/places.js";
 import { rowBalls } from "../../hyrf/row_states.js";
@@ -390,8 +391,7 @@ export class SceneStream {
       if (part) await this.receivePart(part, bytes);
       else await this.receiveChunk(file, bytes);
     } catch (error) {
-      const isMemory = error instanceof RangeError; // thrown for arrays that are too long
-      this.reject(file, isMemory ? "there is not enough memory for it" : reasonOf(error));
+      this.reject(file, reasonOf(explainMemory(error)));
     }
     this.decoding.delete(file.file);
     this.schedule();
@@ -519,11 +519,8 @@ export class SceneStream {
 }
 
 // Returns the first camera of a scene, in world units, as far as its manifest says.
-function firstCamera({ viewpoint, cameras, frame }) {
-  const { center, scale } = frame ?? {}, isFrame = Array.isArray(center) && center.every(Number.isFinite) && scale > 0;
-  const usedFrame = isFrame ? frame : { center: [0, 0, 0], scale: 1 };
-  return viewpointOf({ provenance: { viewpoint, cameras }, config: { frame: usedFrame } }).cameras[0];
-}
+const firstCamera = ({ viewpoint, cameras, frame }) =>
+  viewpointOf({ provenance: { viewpoint, cameras }, config: { frame } }).cameras[0];
 
 // Returns the coarsest level of a chunk whose file is usable, or null.
 function coarsestUsable(chunk) {

@@ -122,9 +122,8 @@ class StreamLoader extends Loader {
     else this.post({ again: true });
   }
 
-  ask() {
-    const text = "A scene folder cannot be edited; edit the file that hyrfpack decompress joins.";
-    return Promise.reject(new Error(text));
+  async ask() {
+    throw new Error("A scene folder cannot be edited; edit the file that hyrfpack decompress joins.");
   }
 
   // ---- for StreamedFields

@@ -254,7 +254,7 @@ export class StreamedFields extends Fields {
       const { rows } = await this.coloured(view, margin, { goOn, exact });
       if (rows) changed();
       await new Promise((resolve) => setTimeout(resolve, POLL_MS));
-      if (!goOn() || this.isDisposed) return false;
+      if (!goOn() || this.isDisposed || this.events.failure) return false;
       if (this.fades.size && performance.now() > this.fadedAt + MAX_FRAME_WAIT_MS) this.endFades();
     }
     return super.complete(view, margin, options);
