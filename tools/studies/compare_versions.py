@@ -13,15 +13,17 @@ so one budget is enough for the change of bytes at equal PSNR:
 
     python -m tools.studies.compare_versions --against ../before --shares measured --sizes 1 0.7 0.5 0.35
 
-Runs are kept in --out and are not repeated; a file with scores is not scored again. The other version runs with the
-packages of this environment, and with --against-options for `train`.
+Runs are kept in --out and are not repeated while the version that trains them and its options stay the same. Their
+scores are kept while this version stays the same. Uncommitted changes count as another version. The other version runs
+with the packages of this environment, and with --against-options for `train`.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-import resource
+import shutil
 import subprocess
 import sys
 import warnings
@@ -33,9 +35,11 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 import hyrfpack
+from hyrfpack.errors import HyrfError
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig
 from hyrfpack.train.setup import budget_for
+from tools.cpu_time import children_cpu_seconds
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
 
@@ -56,6 +60,7 @@ DEFAULT_SETS = (
 )
 ESTIMATED_BUDGET_SHARE = "measured"
 SCORE_KEYS = ("bytes", "psnr", "ssim", "seconds", "gaussians")
+VERSIONS_FILE = "versions.json"
 
 
 def train_and_score(
@@ -71,8 +76,11 @@ def train_and_score(
     """Train and compress with one version, score with this one, and return bytes, scores, CPU seconds and Gaussians.
 
     With `gaussians` None, the version chooses its budget. `options` are further options of its command `train`. `size`
-    is the share of the bytes of the version's default file that the scored file may have; 1 for that file itself.
+    is the share of the bytes of the version's default file that the scored file may have; 1 for that file itself. What
+    `out` holds is used again where it comes from the same versions, options and number of Gaussians.
     """
+    training = {"version": describe_version(version), "options": list(options), "gaussians": gaussians}
+    remove_outdated(out, training, describe_version(REPOSITORY_ROOT))
     suffix = "" if size == 1 else f"-{size:g}"
     scores_file = out / f"scores{suffix}.json"
     if scores_file.exists():
@@ -81,9 +89,9 @@ def train_and_score(
     if not cpu_time.exists():
         settings = ["--steps", str(steps), "--seed", str(seed), "--overwrite", *options]
         budget = [] if gaussians is None else ["--max-gaussians", str(gaussians)]
-        before = _children_cpu_seconds()
+        before = children_cpu_seconds()
         _run_command(version, "train", str(scene.path), "-o", str(out), *settings, *budget)
-        cpu_time.write_text(json.dumps(_children_cpu_seconds() - before))
+        cpu_time.write_text(json.dumps(children_cpu_seconds() - before))
     default_file, packed = out / "compact.hyrf", out / f"compact{suffix}.hyrf"
     packed.unlink(missing_ok=True)
     limit = [] if size == 1 else ["--target-size", str(round(size * default_file.stat().st_size))]
@@ -100,10 +108,37 @@ def train_and_score(
     return result
 
 
-def _children_cpu_seconds() -> float:
-    """Return the CPU seconds of all commands that have ended."""
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
+def describe_version(folder: Path) -> str:
+    """Return a name of the commit that a work tree holds, with a digest of its uncommitted changes.
+
+    Raises:
+        HyrfError: the folder is no work tree of git.
+    """
+
+    def run_git(*words: str) -> str:
+        process = subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True, check=False)
+        if process.returncode:
+            problem = f"{folder}: git cannot tell the version ({process.stderr.strip()})"
+            raise HyrfError(problem, fix="make the folder with git worktree add")
+        return process.stdout.strip()
+
+    name = run_git("describe", "--always", "--dirty", "--abbrev=12")
+    if name.endswith("-dirty"):
+        name += "-" + hashlib.sha256(run_git("diff", "HEAD").encode()).hexdigest()[:8]
+    return name
+
+
+def remove_outdated(out: Path, training: dict, scoring: str) -> None:
+    """Remove a run that was not trained as `training` says, or its scores if they are not of the version `scoring`."""
+    record = out / VERSIONS_FILE
+    versions = json.loads(record.read_text()) if record.exists() else {}
+    if versions.get("training") != training:
+        shutil.rmtree(out, ignore_errors=True)
+    elif versions["scoring"] != scoring:
+        for path in out.glob("scores*.json"):
+            path.unlink()
+    out.mkdir(parents=True, exist_ok=True)
+    record.write_text(json.dumps({"training": training, "scoring": scoring}))
 
 
 def _run_command(version: Path, command: str, *arguments: str) -> None:
@@ -118,25 +153,25 @@ def _run_command(version: Path, command: str, *arguments: str) -> None:
 def bytes_change_at_equal_psnr(ours: np.ndarray, theirs: np.ndarray) -> float | None:
     """Return the BD-rate (Bjontegaard) of `ours` against `theirs`: -0.3 means 30 % fewer bytes at equal PSNR.
 
-    It returns None if the ranges of PSNR do not overlap.
+    Larger files that have no higher PSNR than smaller ones are ignored. It returns None if the ranges of PSNR of the
+    others do not overlap.
 
     Args:
         ours, theirs: (n, 2) bytes and PSNR of the same scene at n sizes.
     """
-    low = max(points[:, 1].min() for points in (ours, theirs))
-    high = min(points[:, 1].max() for points in (ours, theirs))
-    if low >= high:
-        return None
-    means = []
+    curves = []
     for points in (ours, theirs):
         rising = points[np.argsort(points[:, 0])]
         best = np.maximum.accumulate(rising[:, 1])  # a larger file with a lower PSNR is not worth using
         is_better = np.concatenate(([True], np.diff(best) > 0))
         if is_better.sum() < 2:
             return None
-        curve = PchipInterpolator(best[is_better], np.log(rising[is_better, 0]))
-        means.append(curve.integrate(low, high) / (high - low))
-    return float(np.exp(means[0] - means[1]) - 1)
+        curves.append(PchipInterpolator(best[is_better], np.log(rising[is_better, 0]), extrapolate=False))
+    low, high = max(curve.x[0] for curve in curves), min(curve.x[-1] for curve in curves)
+    if low >= high:
+        return None
+    log_bytes = [curve.integrate(low, high) / (high - low) for curve in curves]
+    return float(np.exp(log_bytes[0] - log_bytes[1]) - 1)
 
 
 def score_gain_at_equal_bytes(ours: np.ndarray, theirs: np.ndarray) -> float:
@@ -217,7 +252,6 @@ def main() -> None:
                 seeds = []
                 for seed in range(args.seeds):
                     out = args.out.resolve() / f"{args.steps}" / name / f"{version}-{share}-{seed}"
-                    out.mkdir(parents=True, exist_ok=True)
                     gaussians = None if share == ESTIMATED_BUDGET_SHARE else round(float(share) * budget)
                     options = args.against_options if version == "before" else []
                     seeds.append(train_and_score(folder, scene, args.steps, gaussians, seed, out, options, size))

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import shutil
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,7 @@ from hyrfpack.poses.alignment import Poses, align_poses
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.mapping import read_pieces
 from hyrfpack.poses.process import run_stage
+from tools.cpu_time import children_cpu_seconds
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
@@ -44,12 +44,6 @@ def read_poses(model: pycolmap.Reconstruction, job: Job | None = None) -> Poses:
         name = image.name if job is None else job.names[image.image_id - 1]
         poses[name.rpartition(".")[0]] = np.asarray(image.cam_from_world().matrix())
     return poses
-
-
-def children_cpu_seconds() -> float:
-    """Return the CPU seconds of all processes that this one has started and waited for."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 def measure(folder: Path, out: Path, seed: int) -> dict:
