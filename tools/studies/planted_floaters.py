@@ -48,12 +48,12 @@ def plant_floaters(
     """
     generator = np.random.default_rng(seed)
     count = round(share * len(model))
-    candidates = _random_floaters(model, cameras, CANDIDATES_PER_FLOATER * count, generator)
+    candidates, is_near = _random_floaters(model, cameras, CANDIDATES_PER_FLOATER * count, generator)
     opacities, scales = _opacities_and_scales(candidates)
     low, high = np.quantile(_opacities_and_scales(model)[1], SCALE_QUANTILES)
     usable = (opacities > MIN_OPACITY) & (scales > low) & (scales < high)
-    is_near = np.arange(len(usable)) < len(usable) // 2
-    halves = [np.flatnonzero(usable & kind)[: count // 2] for kind in (is_near, ~is_near)]
+    usable_halves = [np.flatnonzero(usable & kind) for kind in (is_near, ~is_near)]
+    halves = [generator.choice(half, min(count // 2, len(half)), replace=False) for half in usable_halves]
     chosen = torch.from_numpy(np.concatenate(halves))
     parts = zip(_parameters(model), _parameters(candidates), strict=True)
     planted = _with_gaussians(model, [torch.cat((old, new[chosen])) for old, new in parts])
@@ -62,9 +62,9 @@ def plant_floaters(
 
 def _random_floaters(
     model: HybridModel, cameras: list[Camera], count: int, generator: np.random.Generator
-) -> HybridModel:
-    """Return a model with the fields of `model` and `count` random floaters, the first half of them near cameras."""
-    positions = []
+) -> tuple[HybridModel, np.ndarray]:
+    """Return a model with the fields of `model` and `count` random floaters, and a mask of those near cameras."""
+    positions, near_masks = [], []
     viewpoints = evenly_spaced(cameras, PLANTING_VIEWS)
     for part, camera in zip(np.array_split(np.arange(count), len(viewpoints)), viewpoints, strict=True):
         with torch.no_grad():
@@ -78,13 +78,15 @@ def _random_floaters(
         z = np.where(is_near, median * generator.uniform(*NEAR_DEPTHS, len(part)), free)
         local = np.stack(((x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z), axis=1)
         world = (local - camera.camera_from_world[:3, 3]) @ camera.rotation
-        positions += [world[is_near], world[~is_near]]
+        positions.append(world)
+        near_masks.append(is_near)
     frame = model.config.frame
-    placed = (np.concatenate(positions[::2] + positions[1::2]) - np.array(frame.center)) / frame.scale
+    placed = (np.concatenate(positions) - np.array(frame.center)) / frame.scale
     colors = generator.normal(0, 1.5, (len(placed), 3))
     donors = torch.from_numpy(generator.integers(0, len(model), len(placed)))
     shapes = [logits[donors] for logits in _parameters(model)[2:]]
-    return _with_gaussians(model, [torch.from_numpy(placed).float(), torch.from_numpy(colors).float(), *shapes])
+    parameters = [torch.from_numpy(placed).float(), torch.from_numpy(colors).float(), *shapes]
+    return _with_gaussians(model, parameters), np.concatenate(near_masks)
 
 
 def _parameters(model: HybridModel) -> list[torch.Tensor]:
