@@ -14,6 +14,7 @@ MAX_EXTRA_ADDRESS_SPACE_BYTES of address space, or (for one input in TRACE_EVERY
 
 For one input in FILE_CHECK_EVERY, `load` and `describe` of a file must agree with the decoder, and `hyrfpack info` must
 print it. One decoded model in RENDER_EVERY is rendered. Inputs run in worker processes, which are replaced if they die.
+If MAX_FAILED_STARTS workers die before their first input, the run fails and says how many inputs were not examined.
 """
 
 from __future__ import annotations
@@ -57,6 +58,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import MAX_LOG_GAIN
 from hyrfpack.model.merged import MergedModel, parts_of, scene_of
 from hyrfpack.render.renderer import render_view
+from tools.cpu_time import children_cpu_seconds
 from tools.safety.fuzz_mutate import load_merged_seed_files, load_seed_files, make_hostile_file
 
 MAX_CPU_SECONDS = 2.0
@@ -66,6 +68,7 @@ ALLOWED_BASE_BYTES = 16 << 20
 TRACE_EVERY, FILE_CHECK_EVERY, RENDER_EVERY = 100, 100, 20
 MAX_MESSAGE_CHARACTERS = 1000
 INPUTS_PER_BATCH = 1000
+MAX_FAILED_STARTS = 3  # of workers, one after the other, before a thread gives up
 STUCK_WORKER_SECONDS = (
     300  # compiled code may not react to the CPU time signal, so a silent worker is killed after this
 )
@@ -302,7 +305,7 @@ class FuzzRun:
     def __init__(self, count: int, seed: int, jobs: int) -> None:
         self.count, self.seed, self.jobs = count, seed, jobs
         self.batches = itertools.count(0, INPUTS_PER_BATCH)
-        self.tally, self.resident = Tally(), 0
+        self.tally, self.resident, self.deaths, self.unexamined = Tally(), 0, 0, 0
         self.lock = threading.Lock()
 
     def run(self) -> Tally:
@@ -311,23 +314,28 @@ class FuzzRun:
             thread.start()
         for thread in threads:
             thread.join()
+        self.unexamined = self.count - self.tally.kinds.total() - self.deaths
         return self.tally
 
     def _serve(self) -> None:
-        worker = _Worker(self.seed)
+        worker, failed_starts = _Worker(self.seed), 0
         while (first := next(self.batches)) < self.count:
             numbers = list(range(first, min(first + INPUTS_PER_BATCH, self.count)))
             while numbers:
                 answer = worker.ask(numbers)
                 if answer is None:
-                    killer = worker.current.value
-                    with self.lock:
-                        self.tally.failures[killer] = f"the worker died: exit code {worker.process.exitcode}"
-                    if killer not in numbers:  # the worker died before its first input
+                    killer, exit_code = worker.current.value, worker.process.exitcode
+                    failed_starts = 0 if killer in numbers else failed_starts + 1
+                    if failed_starts == MAX_FAILED_STARTS:
                         return
-                    numbers.remove(killer)
+                    if killer in numbers:  # else the worker died before its first input
+                        numbers.remove(killer)
+                        with self.lock:
+                            self.deaths += 1
+                            self.tally.failures[killer] = f"the worker died: exit code {exit_code}"
                     worker = _Worker(self.seed)
                     continue
+                failed_starts = 0
                 with self.lock:
                     self.tally.add(answer[0])
                     self.resident = max(self.resident, answer[1])
@@ -354,6 +362,7 @@ class _Worker:
 
     def ask(self, numbers: list[int]) -> tuple[Tally, int] | None:
         """Return the tally of these inputs and the worker's largest resident size in bytes; None if it died."""
+        self.current.value = -1
         try:
             self.pipe.send(numbers)
             before = -1
@@ -369,8 +378,7 @@ class _Worker:
 
 def report(tally: Tally, resident: int, seconds: float) -> str:
     """Format the summary of a run; `resident` is the largest resident size of a worker in bytes."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cores = used.ru_utime + used.ru_stime
+    cores = children_cpu_seconds()
     total, decoded = tally.kinds.total(), tally.decoded.total()
     lines = [
         f"{total:,} inputs in {seconds:.0f} s ({total / seconds:.0f}/s, {total / cores:.0f} per "
@@ -417,7 +425,11 @@ def main() -> int:
         name.with_suffix(".hyrf").write_bytes(make_hostile_file(number, options.seed)[1])
         name.with_suffix(".txt").write_text(f"--seed {options.seed} --only {number}\n{description}")
         print(f"FAILED {name}.hyrf: {description.splitlines()[0][:200]}")
-    return 1 if tally.failures else 0
+    if fuzz_run.unexamined:
+        print(
+            f"FAILED: {fuzz_run.unexamined:,} inputs were not examined, because workers died before their first input"
+        )
+    return 1 if tally.failures or fuzz_run.unexamined else 0
 
 
 if __name__ == "__main__":

@@ -5,8 +5,9 @@
 The inputs are those of `fuzz_mutate.make_hostile_file`. Every fourth input is read as the start of a file, the others
 as whole files. Both readers must accept an input, or both must refuse it. Accepted numbers must be equal bit for bit. A
 refusal must be one printable line. The reader in JavaScript may take MIN_LIMIT_SECONDS of CPU time plus
-MAX_JAVASCRIPT_RATIO times that of the reader in Python. Anything else is a failure, and the input is saved with its
-seed and number. It prints a summary with counts and seconds of CPU time, and exits with 1 after a failure.
+MAX_JAVASCRIPT_RATIO times that of the reader in Python. Anything else is a failure, such as the end of node or another
+exception in Python, and the input is saved with its seed and number. It prints a summary with counts and seconds of CPU
+time, and exits with 1 after a failure.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ class Verdict:
         groups: SHA-256 of each group's numbers as float32, by section, and by number after the first part of a merged
             file; empty if the file is refused.
         refused: the message of the refusal, else empty.
-        failed: an unexpected error, else empty.
+        failed: an unexpected error or the end of node, else empty.
         seconds: CPU time.
         layers: number of Gaussians of each layer that was read (JavaScript, accepted files).
         whole: whether all layers were read (JavaScript, accepted files).
@@ -87,29 +88,44 @@ def read_in_python(data: bytes, is_start: bool = False) -> Verdict:
         }
     except HyrfFormatError as error:
         return Verdict(refused=str(error), seconds=time.process_time() - start)
+    except Exception as error:
+        return Verdict(failed=f"{type(error).__name__}: {error}", seconds=time.process_time() - start)
     hashes = {group: hashlib.sha256(values.tobytes()).hexdigest() for group, values in groups.items()}
     return Verdict(hashes, seconds=time.process_time() - start)
 
 
 def read_in_javascript(files: Sequence[tuple[bytes, bool]]) -> list[Verdict]:
-    """Read files with the JavaScript decoder under node.
+    """Read files with the JavaScript decoder under node, which is started again after a file at which it ends.
 
     Args:
         files: the bytes of each file, and whether it is the start of a file.
-
-    Raises:
-        RuntimeError: node ended early; the message has the number of the file.
     """
+    verdicts: list[Verdict] = []
+    while len(verdicts) < len(files):
+        read, failed = _read_until_end(files[len(verdicts) :])
+        verdicts += read
+        if failed:
+            verdicts.append(Verdict(failed=failed))
+    return verdicts
+
+
+def _read_until_end(files: Sequence[tuple[bytes, bool]]) -> tuple[list[Verdict], str]:
+    """Return the results of one run of node, and how it failed at the file after these, "" if it read all files."""
     with tempfile.TemporaryDirectory() as folder:
         batch = Path(folder) / "files"
         batch.write_bytes(b"".join(struct.pack("<IB", len(data), is_start) + data for data, is_start in files))
-        run = subprocess.run(
-            ["node", str(READER_SCRIPT), str(batch)], capture_output=True, text=True, timeout=NODE_BATCH_TIMEOUT_SECONDS
-        )
-    answers = [json.loads(line) for line in run.stdout.splitlines()]
-    if run.returncode or len(answers) != len(files):
-        raise RuntimeError(f"node ended at file {len(answers)}: {run.stderr[-2000:]}")
-    return [
+        output, errors = Path(folder) / "output", Path(folder) / "errors"
+        with output.open("wb") as stdout, errors.open("wb") as stderr:
+            command = ["node", str(READER_SCRIPT), str(batch)]
+            try:
+                run = subprocess.run(command, stdout=stdout, stderr=stderr, timeout=NODE_BATCH_TIMEOUT_SECONDS)
+                end = f"exit code {run.returncode}"
+            except subprocess.TimeoutExpired:
+                end = f"not done within {NODE_BATCH_TIMEOUT_SECONDS} s"
+        answers = [json.loads(line) for line in output.read_text("utf-8", "replace").split("\n")[:-1]]
+        message = errors.read_text("utf-8", "replace")[-2000:]
+    failed = "" if len(answers) == len(files) else f"node ended: {end}: {message}"
+    verdicts = [
         Verdict(
             answer.get("groups", {}),
             answer.get("refused", ""),
@@ -121,14 +137,18 @@ def read_in_javascript(files: Sequence[tuple[bytes, bool]]) -> list[Verdict]:
         )
         for answer in answers
     ]
+    return verdicts, failed
 
 
 def find_disagreement(python: Verdict, javascript: Verdict) -> str:
     """Return how two results of one file disagree, or which rule they break; "" if neither is the case."""
-    if javascript.failed:
-        return f"JavaScript fails: {javascript.failed}"
+    for language, verdict in (("Python", python), ("JavaScript", javascript)):
+        if verdict.failed:
+            return f"{language} fails: {verdict.failed}"
     if bool(python.refused) != bool(javascript.refused):
         return f"Python: {python.refused or 'accepted'!r:.500}; JavaScript: {javascript.refused or 'accepted'!r:.500}"
+    if one_sided := python.groups.keys() ^ javascript.groups.keys():
+        return f"only one reader has {', '.join(sorted(one_sided))}"
     if wrong := [group for group, digest in python.groups.items() if javascript.groups[group] != digest]:
         return f"different numbers in {', '.join(wrong)}"
     if javascript.refused and not (
@@ -176,7 +196,7 @@ def compare(numbers: Sequence[int], seed: int = 0) -> Tally:
         tally.kinds[kind] += 1
         if javascript.refused:
             tally.refused[message_pattern(javascript.refused)] += 1
-        else:
+        elif not javascript.failed:
             tally.accepted[kind] += 1
         tally.slowest = max(tally.slowest, (javascript.seconds, number))
         if wrong := find_disagreement(python, javascript):
