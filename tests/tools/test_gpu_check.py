@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -477,6 +478,38 @@ def test_a_program_that_ignores_the_interrupt_is_killed_and_its_lines_are_kept(
     process = TimedProcess([sys.executable, "-c", script], 3.0, tmp_path / "log.txt")
     assert list(process.lines()) == ["begun\n"] and (tmp_path / "log.txt").read_text() == "begun\n"
     assert process.is_out_of_time and process.exit_code < 0
+
+
+def test_a_program_that_takes_too_long_is_killed_with_the_processes_it_has_started() -> None:
+    sleeping_child = "(trap '' INT; echo begun; exec sleep 60)"
+    start = time.monotonic()
+    process = TimedProcess(["bash", "-c", f"{sleeping_child} & exit 3"], 1.0, None)
+    assert list(process.lines()) == ["begun\n"] and process.exit_code == 3
+    assert time.monotonic() - start < 50, "the sleeping child has kept the output open"
+
+
+@pytest.mark.parametrize("folder", ["docs", "build", "../elsewhere", "build/../docs"])
+def test_only_a_folder_below_build_is_replaced_by_a_prepared_set(
+    folder: str, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "repository"
+    for name in ("repository/docs", "repository/build", "elsewhere"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "kept").touch()
+    monkeypatch.setattr(gpu_prepare, "REPOSITORY_ROOT", root)
+    monkeypatch.setattr(gpu_prepare, "BUILD_FOLDER", root / "build")
+    with pytest.raises(SystemExit):
+        gpu_prepare.main(["--data", str(data), "--folder", folder])
+    assert len(list(tmp_path.rglob("kept"))) == 3
+
+
+def test_a_prepared_set_stays_if_the_next_cannot_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gpu_prepare, "REPOSITORY_ROOT", tmp_path)
+    monkeypatch.setattr(gpu_prepare, "BUILD_FOLDER", tmp_path / "build")
+    (tmp_path / "build" / "gpu" / "bonsai").mkdir(parents=True)
+    with pytest.raises(HyrfError):
+        gpu_prepare.main(["--data", str(tmp_path / "missing")])
+    assert [path.name for path in (tmp_path / "build").rglob("*")] == ["gpu", "bonsai"]
 
 
 def test_the_first_part_runs_each_case_of_the_self_test_and_then_the_doctor(tmp_path: Path) -> None:

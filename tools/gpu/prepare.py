@@ -4,7 +4,7 @@
 
 It copies the set with the poses of a COLMAP model as a transforms.json, which hyrfpack reads without pycolmap, and
 checks that folder and repository together are small enough to be copied to the machine. The folder lies in build/,
-which git ignores, so name it where the machine asks for extra paths.
+which git ignores, so name it where the machine asks for extra paths. What it held before is replaced.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import json
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from hyrfpack.ply import encode_colored_points
 from hyrfpack.scene import Scene
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
+BUILD_FOLDER = REPOSITORY_ROOT / "build"
 MAX_MEGABYTES = 64.0
 POINTS_FILE = "points.ply"
 
@@ -92,13 +94,19 @@ def tree_bytes() -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="a small data set to copy")
-    parser.add_argument("--folder", type=Path, default=Path("build/gpu"), help="the folder, in the repository")
+    parser.add_argument("--folder", type=Path, default=Path("build/gpu"), help="a folder below build/ (build/gpu)")
     parser.add_argument("--out", default="$OUT", help="the folder for results there ($OUT)")
     args = parser.parse_args(arguments)
-    folder = REPOSITORY_ROOT / args.folder
-    shutil.rmtree(folder, ignore_errors=True)
-    # The report names the set by its folder.
-    copy_dataset(args.data, folder / args.data.name)
+    folder = (REPOSITORY_ROOT / args.folder).resolve()
+    if BUILD_FOLDER.resolve() not in folder.parents:
+        parser.error(f"--folder {args.folder} would be replaced; name a folder below build/, such as build/gpu")
+    BUILD_FOLDER.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=BUILD_FOLDER) as made:
+        # The report names the set by its folder.
+        copy_dataset(args.data, Path(made, "copy", args.data.name))
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        Path(made, "copy").rename(folder)
     megabytes = (folder_bytes(folder) + tree_bytes()) / 2**20
     print(f"{args.folder}: {folder_bytes(folder) / 2**20:.1f} MiB; with the repository {megabytes:.1f} MiB")
     if megabytes > MAX_MEGABYTES:

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Timer
 
@@ -15,6 +16,8 @@ SECONDS_TO_END = 8.0
 
 class TimedProcess:
     """A program that is interrupted after its time limit, and killed if it has not ended SECONDS_TO_END later.
+
+    Signals go to the processes that it has started, too, which would else hold its output open.
 
     Attributes:
         is_out_of_time: whether it was interrupted.
@@ -42,8 +45,9 @@ class TimedProcess:
             text=True,
             errors="replace",
             env=dict(environment),
+            start_new_session=True,
         )
-        self._timers = [Timer(seconds, self._interrupt), Timer(seconds + SECONDS_TO_END, self._process.kill)]
+        self._timers = [Timer(seconds, self._interrupt), Timer(seconds + SECONDS_TO_END, self._kill)]
         for timer in self._timers:
             timer.daemon = True
             timer.start()
@@ -53,14 +57,25 @@ class TimedProcess:
         if self._log is not None:
             self._log.parent.mkdir(parents=True, exist_ok=True)
         assert self._process.stdout is not None
-        with open(self._log or os.devnull, "w", buffering=1) as log:
-            for line in self._process.stdout:
-                log.write(line)
-                yield line
-        self.exit_code = self._process.wait()
-        for timer in self._timers:
-            timer.cancel()
+        try:
+            with open(self._log or os.devnull, "w", buffering=1) as log:
+                for line in self._process.stdout:
+                    log.write(line)
+                    yield line
+            self.exit_code = self._process.wait()
+        finally:
+            for timer in self._timers:
+                timer.cancel()
+            self._kill()  # Without a terminal of its own, the program is not interrupted with its caller.
+            self._process.wait()
 
     def _interrupt(self) -> None:
         self.is_out_of_time = True
-        self._process.send_signal(signal.SIGINT)
+        self._send_signal(signal.SIGINT)
+
+    def _kill(self) -> None:
+        self._send_signal(signal.SIGKILL)
+
+    def _send_signal(self, number: signal.Signals) -> None:
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, number)
