@@ -6,7 +6,7 @@
 The photos are in the order of their names. After a photo come a motion-blurred copy of random direction and length, or
 one or two repeated frames, or neither. The table has the numbers of chosen frames of each kind and seconds. With
 --train it also estimates poses (`hyrfpack.estimate_poses`) and trains, on the photos and on the frames. The table then
-has PSNR in dB on held-out photos with their original pixels.
+has PSNR in dB on the same held-out photos with their original pixels: every 8th photo that has a pose in both cases.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import argparse
 import dataclasses
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,13 +26,14 @@ import hyrfpack
 from hyrfpack.data.pictures import PhotoFile
 from hyrfpack.data.undistort import undistort
 from hyrfpack.poses.frames import RECORD_NAME, FrameReport, choose_frames
-from hyrfpack.scene import Picture, View
+from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train import TrainConfig
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
 DEFAULT_SETS = ("ngp_fox", "drone_caliterra", "gerrard_hall")
 FRAMES_PER_SECOND = 10
+HELD_OUT_EVERY = 8
 
 
 def main() -> None:
@@ -62,12 +63,11 @@ def main() -> None:
         report = choose_frames(out / "clip.mp4", out / "frames")
         rows.append(format_row(name, kinds, out / "frames", report, time.perf_counter() - started))
         if args.train:
-            given = train_and_score(args.data / name / "images", out / "photos", args.steps)
             photo_by_frame = dict(
                 enumerate(photos[number] for number in np.cumsum([kind == "photo" for kind in kinds]) - 1)
             )
-            chosen = train_and_score(out / "clip.mp4", out / "video", args.steps, photo_by_frame)
-            rows[-1] += [f"{given:.2f}", f"{chosen:.2f}", f"{chosen - given:+.2f}"]
+            images, clip = args.data / name / "images", out / "clip.mp4"
+            rows[-1] += compare_training(images, clip, out, args.steps, photo_by_frame)
     header = ["set", "frames", "photos taken", "blurred taken", "repeated taken", "called blurred", "repeated", "s"]
     print(markdown_table(header + (["dB, photos", "dB, video", "difference"] if args.train else []), rows))
 
@@ -135,22 +135,60 @@ def format_row(name: str, kinds: list[str], folder: Path, report: FrameReport, s
     ]
 
 
-def train_and_score(source: Path, out: Path, steps: int, photo_by_frame: dict[int, Path] | None = None) -> float:
-    """Train on estimated poses; return PSNR in dB on held-out photos.
+def find_photos(scene: Scene, photo_by_frame: Mapping[int, Path] | None = None) -> dict[str, str]:
+    """Return the name without ending of the photo that each view shows, by the view's name.
 
-    `photo_by_frame` has the photo of each frame of a video, whose pixels replace those of held-out frames.
+    `photo_by_frame` has the photo of each frame if the scene comes from a video.
     """
-    hyrfpack.estimate_poses(source, out / "scene", overwrite=True)
-    scene = hyrfpack.load_scene(out / "scene")
-    if photo_by_frame is not None:
-        scene = dataclasses.replace(scene, test=[_replace_by_photo(view, photo_by_frame) for view in scene.test])
+    if photo_by_frame is None:
+        return {view.name: Path(view.name).stem for view in scene.train + scene.test}
+    return {view.name: photo_by_frame[_frame_number(view)].stem for view in scene.train + scene.test}
+
+
+def hold_out(scene: Scene, photo_by_view: Mapping[str, str], held_out: Sequence[str]) -> Scene:
+    """Return the scene with one test view of each held-out photo, and with no other view of these photos.
+
+    Args:
+        scene: the scene.
+        photo_by_view: the photo that each view shows.
+        held_out: the held-out photos.
+    """
+    views = sorted(scene.train + scene.test, key=lambda view: view.name)
+    test = {photo_by_view[view.name]: view for view in reversed(views) if photo_by_view[view.name] in held_out}
+    train = [view for view in views if photo_by_view[view.name] not in held_out]
+    return dataclasses.replace(scene, train=train, test=sorted(test.values(), key=lambda view: view.name))
+
+
+def train_and_score(scene: Scene, out: Path, steps: int) -> float:
+    """Train on a scene; return PSNR in dB on its held-out photos."""
     result = hyrfpack.train_model(scene, out / "run", TrainConfig(steps=steps, budget_factor=1.0), overwrite=True)
     return result.metrics["evaluation"]["psnr"]
 
 
-def _replace_by_photo(view: View, photo_by_frame: dict[int, Path]) -> View:
+def compare_training(photos: Path, video: Path, out: Path, steps: int, photo_by_frame: Mapping[int, Path]) -> list[str]:
+    """Train on photos and on a video of them; return PSNR in dB of both on the same photos, and the difference.
+
+    `photo_by_frame` has the photo of each frame of the video, whose pixels replace those of held-out frames.
+    """
+    scenes = {}
+    for kind, source in (("photos", photos), ("video", video)):
+        hyrfpack.estimate_poses(source, out / kind / "scene", overwrite=True)
+        scenes[kind] = hyrfpack.load_scene(out / kind / "scene")
+    shown = {"photos": find_photos(scenes["photos"]), "video": find_photos(scenes["video"], photo_by_frame)}
+    held_out = sorted(set(shown["photos"].values()) & set(shown["video"].values()))[::HELD_OUT_EVERY]
+    split = {kind: hold_out(scene, shown[kind], held_out) for kind, scene in scenes.items()}
+    test = [_replace_by_photo(view, photo_by_frame[_frame_number(view)]) for view in split["video"].test]
+    split["video"] = dataclasses.replace(split["video"], test=test)
+    given, chosen = (train_and_score(scene, out / kind, steps) for kind, scene in split.items())
+    return [f"{given:.2f}", f"{chosen:.2f}", f"{chosen - given:+.2f}"]
+
+
+def _frame_number(view: View) -> int:
+    return int(Path(view.name).stem.rpartition("_")[2])
+
+
+def _replace_by_photo(view: View, photo: Path) -> View:
     """Return a frame's view with the pixels of its photo, cropped to the frame's even size."""
-    photo = photo_by_frame[int(Path(view.name).stem.rpartition("_")[2])]
 
     def load() -> Picture:
         frame = view.load
