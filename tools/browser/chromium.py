@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from tools.browser.browser import TIMEOUT_SECONDS, Browser
 
 if TYPE_CHECKING:
-    from playwright.async_api import ConsoleMessage
+    from playwright.async_api import Browser as ChromiumBrowser
+    from playwright.async_api import ConsoleMessage, Playwright
 
 Result = TypeVar("Result")
 # WebGPU in software (SwiftShader). Without the last three, WebGL cannot read what WebGPU has drawn.
@@ -56,7 +57,14 @@ class Chromium(Browser):
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._thread.start()
-        self._wait(self._start(flags))
+        self._playwright: Playwright | None = None
+        self._browser: ChromiumBrowser | None = None
+        try:
+            self._wait(self._start(flags))
+        except BaseException:
+            with contextlib.suppress(Exception):
+                self.close()
+            raise
 
     async def _start(self, flags: tuple[str, ...]) -> None:
         from playwright.async_api import async_playwright
@@ -83,8 +91,15 @@ class Chromium(Browser):
             self._errors.append(message.text)
 
     def close(self) -> None:
-        self._wait(self._browser.close())
-        self._wait(self._playwright.stop())
+        try:
+            if self._browser is not None:
+                self._wait(self._browser.close())
+            if self._playwright is not None:
+                self._wait(self._playwright.stop())
+        finally:
+            self._stop_loop()
+
+    def _stop_loop(self) -> None:
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()

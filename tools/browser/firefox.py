@@ -63,8 +63,17 @@ def _start_display() -> tuple[subprocess.Popen, int]:
     command = ["Xvfb", "-displayfd", str(writes), "-screen", "0", "1600x1200x24", "-nolisten", "tcp"]
     process = subprocess.Popen(command, pass_fds=(writes,), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     os.close(writes)
-    with os.fdopen(reads) as answer:
-        return process, int(answer.readline())
+    try:
+        with os.fdopen(reads) as answer:
+            return process, int(answer.readline())
+    except BaseException:
+        _end_process(process)
+        raise
+
+
+def _end_process(process: subprocess.Popen) -> None:
+    process.kill()
+    process.wait()
 
 
 def _script_address(script: str) -> str:
@@ -91,23 +100,24 @@ class Firefox(Browser):
         self._received = b""
         program = find()
         assert program
-        self._display, number = _start_display()
+        display, number = _start_display()
+        self._processes = [display]
         environment = {"HOME": str(profile), "DISPLAY": f":{number}", "LIBGL_ALWAYS_SOFTWARE": "1"}
-        self._process = subprocess.Popen(
-            [program, "--no-remote", "--marionette", "--remote-allow-system-access", "--profile", profile],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            env={**os.environ, **environment, "MOZ_CRASHREPORTER_DISABLE": "1"},
-        )
         try:
+            self._process = subprocess.Popen(
+                [program, "--no-remote", "--marionette", "--remote-allow-system-access", "--profile", profile],
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, **environment, "MOZ_CRASHREPORTER_DISABLE": "1"},
+            )
+            self._processes.insert(0, self._process)
             self._socket = self._connect(profile / "MarionetteActivePort")
             self._receive()  # the browser begins with a greeting
             self.call("WebDriver:NewSession", strictFileInteractability=False)
             self._forward_console()
             self.call("WebDriver:SetTimeouts", script=int(TIMEOUT_SECONDS * 1000), pageLoad=int(TIMEOUT_SECONDS * 1000))
         except BaseException:
-            self._process.kill()
-            self._display.kill()
+            self._end_processes()
             raise
 
     def close(self) -> None:
@@ -116,9 +126,11 @@ class Firefox(Browser):
         self._socket.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(10)
-        for process in (self._process, self._display):
-            process.kill()
-            process.wait()
+        self._end_processes()
+
+    def _end_processes(self) -> None:
+        for process in self._processes:
+            _end_process(process)
         self._folder.cleanup()
 
     def _connect(self, file: Path) -> socket.socket:
