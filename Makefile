@@ -21,14 +21,12 @@ help: ## list the targets
 
 .venv: $(VENV_STAMP) ## make or refresh the environment
 
-# The environment is refreshed when a dependency has changed since the stamp file was written. Some versions in
-# constraints.txt have no wheels for Python 3.10, which takes the newest versions that it can. Python compiles what is
+# The environment is refreshed when a dependency has changed since the stamp file was written. Python compiles what is
 # imported; pip would compile all 11,000 files one after another.
 $(VENV_STAMP): pyproject.toml constraints.txt
 	@echo "Installing hyrfpack and its tools into .venv (a minute or two when new) ..."
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	@$(BIN)/python -m pip install --disable-pip-version-check --no-compile -e ".[dev]" \
-		$$($(BIN)/python -c 'import sys; print("-c constraints.txt" * (sys.version_info >= (3, 11)))') \
+	@$(BIN)/python -m pip install --disable-pip-version-check --no-compile -e ".[dev]" -c constraints.txt \
 		| { grep --line-buffered -oE '^(Collecting|Building|Installing|Successfully installed) ?[^ ]*' || true; }
 	@touch $@
 
@@ -60,7 +58,7 @@ test: style $(NODE_STAMP) ## check style and types, and run the tests of every c
 test-all: lint $(NODE_STAMP) $(BUNDLERS_STAMP) ## check style and types, then run all tests
 	$(PYTEST)
 
-test-browsers: $(VENV_STAMP) ## run the web player's tests in every installed browser (5 minutes)
+test-browsers: $(VENV_STAMP) $(NODE_STAMP) $(BUNDLERS_STAMP) ## run the web player's tests in every installed browser (5 minutes)
 	HYRFPACK_BROWSERS=all $(PYTEST) tests/web
 
 test-newest: ## run the tests with the newest dependencies, on each installed Python (6 GB and 10 minutes each)
@@ -127,5 +125,5 @@ format: $(VENV_STAMP) ## format the code and fix lint errors
 	$(BIN)/ruff format .
 
 clean: ## remove generated files, except .venv, node_modules and runs/
-	rm -rf build dist demo site *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf build dist demo site *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .versions docs/gpu/logs bench.png
 	find hyrfpack tests tools -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -27,6 +27,7 @@ PICTURE_COUNT = 2
 def check_golden_files() -> str:
     """Compare the numbers of each golden file with the recorded ones."""
     paths = sorted(GOLDEN_FOLDER.glob("*.hyrf"))
+    assert paths, f"{GOLDEN_FOLDER} has no golden files"
     for path in paths:
         recorded = np.load(path.with_suffix(".npz"))
         for name, values in hyrfpack.load_model(path).state_dict().items():
