@@ -1,6 +1,7 @@
 """Programs for maintainers; run them from the repository's root as `python -m tools.<folder>.<name> --help`.
 
 gpu/ checks and measures the GPU kernels, and bench/ times operations against their references. studies/ holds the
-experiments behind the documentation's tables. safety/ damages files and interrupts processes on purpose, and tests
-other versions of the dependencies. browser/ drives browsers and builds the web player.
+experiments behind the documentation's tables. safety/ damages files and interrupts processes on purpose, tests
+other versions of the dependencies, and makes the golden files. browser/ drives browsers and builds the web player.
+scenes/ writes synthetic data sets. tables.py, command.py and cpu_time.py are shared by these.
 """

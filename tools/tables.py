@@ -1,4 +1,4 @@
-"""Format rows as Markdown tables; all tools print their results with these functions."""
+"""Format rows as Markdown tables."""
 
 from __future__ import annotations
 

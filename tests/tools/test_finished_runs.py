@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 import pytest
 
 from hyrfpack.demo.scene import write_demo_scene
+from hyrfpack.errors import HyrfError
 from hyrfpack.train import TrainConfig
 from tools.studies import count_laws, processes
 from tools.studies.train_sets import has_run
@@ -27,7 +28,7 @@ def test_a_set_with_runs_of_two_versions_is_refused(tmp_path):
         folder = tmp_path / "runs" / "demo" / f"{version}-measured-0"
         folder.mkdir(parents=True)
         (folder / "model.hyrf").touch()
-    with pytest.raises(ValueError, match="demo/before-measured-0, demo/now-measured-0"):
+    with pytest.raises(HyrfError, match="demo/before-measured-0, demo/now-measured-0"):
         list(load_runs(tmp_path / "runs", tmp_path / "data"))
 
 

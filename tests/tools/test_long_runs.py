@@ -67,3 +67,24 @@ def test_a_stopped_run_resumes_from_its_checkpoint(run_tool, monkeypatch):
         run_tool()
     run_tool()
     assert resumed == [False, True, False]
+
+
+def test_a_finished_run_gets_the_fine_tuned_file_that_is_asked_for(run_tool, tmp_path, monkeypatch):
+    tuned = []
+
+    def compress(folder, scene, profile, finetune_steps=None):
+        tuned.append(finetune_steps)
+        return {"bytes": 1234, "psnr": 20.0, "ssim": 0.5}
+
+    monkeypatch.setattr(long_runs, "_compress_and_score", compress)
+    row = {"name": "ball", "seed": 0, "exposure": None, "gains": False, "gaussians": 9, "seconds": 1.0}
+    row |= {name: 20.0 for name in ("psnr", "ssim", "training_psnr")}
+    row |= {profile: {"bytes": 1, "psnr": 20.0, "ssim": 0.5} for profile in ("raw", "paper", "compact")}
+    for steps in (10, 20):
+        folder = tmp_path / f"{steps}/seed0/ball"
+        folder.mkdir(parents=True)
+        (folder / "measured.json").write_text(json.dumps(row | {"steps": steps, "steps_taken": steps}))
+    assert "1,234" in run_tool("--finetune", "5") and tuned == [5, 5]
+    assert "1,234" in run_tool("--finetune", "5") and tuned == [5, 5]
+    run_tool("--finetune", "7")
+    assert tuned == [5, 5, 7, 7]

@@ -25,6 +25,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.export.cameras import encode_transforms
 from hyrfpack.ply import encode_colored_points
 from hyrfpack.scene import Scene
+from tools.command import run_command
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
 BUILD_FOLDER = REPOSITORY_ROOT / "build"
@@ -124,4 +125,4 @@ def _git(*words: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

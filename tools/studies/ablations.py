@@ -35,6 +35,7 @@ from hyrfpack.ops.rasterize import shaded
 from hyrfpack.render import renderer
 from hyrfpack.scene import Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig
+from tools.command import run_command
 from tools.studies.ablation_models import FULL_VARIANT, NO_CULLING_VARIANT, TRAINED_VARIANTS, Variant, build_trainer
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
@@ -248,4 +249,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -27,6 +27,7 @@ from hyrfpack.blocks import run as blocks_run
 from hyrfpack.data import PictureCache
 from hyrfpack.edit.transform import Placement
 from hyrfpack.scene import Scene, evenly_spaced
+from tools.command import run_command
 from tools.scenes.layout_city import BLOCKS_PER_SIDE, PITCH_METRES
 from tools.tables import markdown_table
 
@@ -121,4 +122,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -36,6 +36,7 @@ from hyrfpack.scene import Camera, evenly_spaced
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.splats import concatenate
+from tools.command import run_command
 from tools.tables import markdown_table
 
 TARGETS_DB = (25, 30, 35)
@@ -208,4 +209,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

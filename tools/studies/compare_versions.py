@@ -39,6 +39,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig
 from hyrfpack.train.setup import budget_for
+from tools.command import run_command
 from tools.cpu_time import children_cpu_seconds
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
@@ -263,4 +264,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

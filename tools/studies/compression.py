@@ -29,6 +29,7 @@ from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.codec import load_with_provenance, packed_provenance
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import evenly_spaced
+from tools.command import run_command
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
@@ -185,4 +186,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -22,6 +22,7 @@ from hyrfpack.evaluate.figures import draw_comparison
 from hyrfpack.evaluate.metrics import to_8bit
 from hyrfpack.render.files import save_picture
 from hyrfpack.scene import Scene
+from tools.command import run_command
 from tools.studies.set_variants import load_variant
 from tools.studies.train_sets import DATA_FOLDER
 
@@ -73,4 +74,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -30,6 +30,7 @@ from hyrfpack.format.info import sum_layers
 from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
 from hyrfpack.format.sections import LOGIT_SECTIONS, POSITIONS, TABLE_SECTIONS
 from hyrfpack.train import TrainConfig
+from tools.command import run_command
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
 
@@ -166,4 +167,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

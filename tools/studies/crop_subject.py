@@ -25,6 +25,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.render.surface import render_median_depth
 from hyrfpack.scene import Camera, Scene, View
+from tools.command import run_command
 from tools.studies.trained_runs import load_runs, make_runs_parser
 from tools.tables import markdown_table
 
@@ -113,4 +114,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

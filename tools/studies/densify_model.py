@@ -25,6 +25,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.progress import StepEvent, open_display
 from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
+from tools.command import run_command
 
 # A round can at most double the number, and it only splits Gaussians that were visible since the last round.
 SPLIT_ROUNDS, STEPS_PER_ROUND = 20, 6
@@ -124,4 +125,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

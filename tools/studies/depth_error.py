@@ -21,6 +21,7 @@ import hyrfpack
 from hyrfpack.model import HybridModel
 from hyrfpack.render import RenderSettings, render_view, surface
 from hyrfpack.scene import Camera, Scene
+from tools.command import run_command
 from tools.scenes.catalog import LAYOUTS, make_scene
 from tools.scenes.render import cast_pixels
 from tools.studies.mesh_error import demo_depth, nearest_surface, statistics
@@ -112,4 +113,4 @@ def rays_of(camera: Camera) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -29,6 +29,7 @@ from hyrfpack.model import HybridModel, ModelConfig
 from hyrfpack.model.gaussians import logit
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, density, setup, trainer
+from tools.command import run_command
 from tools.studies.train_sets import make_study_parser, measure
 from tools.tables import markdown_row, markdown_table
 
@@ -119,4 +120,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -17,6 +17,7 @@ from pathlib import Path, PurePosixPath
 
 import hyrfpack
 from hyrfpack.scene import Scene
+from tools.command import run_command
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
@@ -100,4 +101,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

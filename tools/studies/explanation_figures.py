@@ -56,6 +56,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import logit
 from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step
 from hyrfpack.scene import Camera
+from tools.command import run_command
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -127,8 +128,8 @@ def resized(camera: Camera, size: int) -> Camera:
     """Return a camera whose picture has a longer side of `size` pixels."""
     factor = size / max(camera.width, camera.height)
     width, height = (max(1, round(factor * side)) for side in (camera.width, camera.height))
-    intrinsics = (factor * value for value in camera.intrinsics)
-    return Camera(width, height, *intrinsics, camera.camera_from_world)
+    fx, fy, cx, cy = (factor * value for value in camera.intrinsics)
+    return Camera(width, height, fx, fy, cx, cy, camera.camera_from_world)
 
 
 @torch.no_grad()
@@ -538,4 +539,4 @@ def save_png(figure: Any, path: Path) -> Path:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

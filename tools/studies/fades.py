@@ -18,6 +18,7 @@ import hyrfpack
 from tools.browser.browser import Browser
 from tools.browser.chromium import Chromium
 from tools.browser.frames import frame_observer_script
+from tools.command import run_command
 from tools.studies.scene_page import serve_scene
 from tools.studies.web_player import PAGE_TIMEOUT_SECONDS
 from tools.tables import markdown_table
@@ -88,4 +89,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

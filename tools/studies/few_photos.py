@@ -20,6 +20,7 @@ import hyrfpack
 from hyrfpack.scene import evenly_spaced
 from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.pilots import split
+from tools.command import run_command
 from tools.studies.set_variants import load_variant
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
@@ -88,4 +89,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

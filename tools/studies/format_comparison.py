@@ -46,6 +46,7 @@ from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS
+from tools.command import run_command
 from tools.studies import gsplat_png
 
 # The settings with which each profile is measured; a profile without an entry uses its defaults.
@@ -325,6 +326,12 @@ def plot(rows: Sequence[MeasuredFile], trained: float, baked: float, title: str,
     save_figure(path, figure, format="png", metadata={"Software": None})
 
 
+def write_report(path: Path, measure: Measurements, rows: list[MeasuredFile]) -> None:
+    """Write the scores of the model and the rows that are measured so far as JSON."""
+    report = {"trained_psnr": measure.trained[0], "baked_psnr": measure.baked_psnr, "rows": list(map(asdict, rows))}
+    path.write_text(json.dumps(report, indent=1))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=Path, help="a trained model.hyrf")
@@ -354,15 +361,15 @@ def main() -> None:
         rows = [measure.measure_own_file(*file) for file in compress_with_profiles(args.model, args.ours, Path(folder))]
     for number, setting in enumerate(settings):
         rows.append(measure.measure_peer(setting))
+        write_report(out / "peers.json", measure, rows)
         print(f"{number + 1}/{len(settings)} {format_table(rows[-1:], len(model)).splitlines()[-1]}", flush=True)
     best = [row for format_rows in group_by_format(rows).values() for row in pareto_front(format_rows)]
     print(f"\nThe settings that no smaller file of the same format equals:\n\n{format_table(best, len(model))}")
-    report = {"trained_psnr": measure.trained[0], "baked_psnr": measure.baked_psnr, "rows": list(map(asdict, rows))}
-    (out / "peers.json").write_text(json.dumps(report, indent=1))
+    write_report(out / "peers.json", measure, rows)
     title = f"{args.data.name}: {len(model):,} Gaussians (peers without the bytes of the background)"
     plot(rows, measure.trained[0], max(measure.baked_psnr), title, out / "peers.png")
     print(f"\nwrote {out / 'peers.json'} and {out / 'peers.png'}")
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

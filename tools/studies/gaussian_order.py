@@ -31,6 +31,7 @@ from hyrfpack.render.in_view import gaussians_in_view
 from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.density import spatial_order
+from tools.command import run_command
 from tools.studies.step_cost import resample_gaussians
 from tools.tables import markdown_table
 
@@ -140,4 +141,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -36,7 +36,8 @@ MIN_SCALE = 4.5e-5  # world units, far below a pixel; also the smallest scale of
 
 def list_missing_packages() -> list[str]:
     """Return the names of the required packages that are not installed."""
-    return [name for name in ("gsplat", "jaxtyping", "imageio") if importlib.util.find_spec(name) is None]
+    names = ("gsplat", "jaxtyping", "wadler_lindig", "imageio")
+    return [name for name in names if importlib.util.find_spec(name) is None]
 
 
 def round_trip(splats: Splats, clusters: int) -> tuple[int, Splats]:

@@ -35,6 +35,7 @@ from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.formats import ply
 from hyrfpack.splats.splats import Splats
+from tools.command import run_command
 from tools.tables import markdown_table
 
 NODE_FOLDER = Path(__file__).parents[2] / "tests" / "node"
@@ -171,4 +172,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -16,6 +16,7 @@ from pathlib import Path
 import hyrfpack
 from tools.browser.browser import Browser
 from tools.browser.chromium import Chromium
+from tools.command import run_command
 from tools.studies.web_player import PAGE_TIMEOUT_SECONDS, open_page
 from tools.tables import markdown_table
 
@@ -62,4 +63,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -26,6 +26,7 @@ from hyrfpack.lod import LevelRenderer
 from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Scene, evenly_spaced
+from tools.command import run_command
 from tools.studies.trained_runs import load_runs, make_runs_parser
 from tools.tables import markdown_table
 
@@ -129,4 +130,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -4,7 +4,8 @@
     python -m tools.studies.long_runs --steps 30000 --table                     only prints the table
 
 Short runs come first. If a call is stopped, the next one resumes from the checkpoint and does not repeat finished runs.
-Several calls can share one queue, because each run's folder is locked while it is trained and measured. The table has
+Several calls can share one queue, because each run's folder is locked while it is trained and measured. --finetune adds
+a fine-tuned file also to finished runs. The table has
 PSNR in dB and SSIM of the raw file on held-out photos, and the gap, which is PSNR on up to 16 training photos minus
 that. It also has bytes and scores of the compressed files as decoded from disk, and seconds of training. Fewer steps
 are taken than asked for if pilot runs say so.
@@ -25,8 +26,9 @@ from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig
+from tools.command import run_command
 from tools.studies.set_variants import load_variant
-from tools.studies.train_sets import DATA_FOLDER
+from tools.studies.train_sets import DATA_FOLDER, list_sets
 from tools.tables import markdown_table
 
 MEASUREMENT_FILE = "measured.json"
@@ -55,11 +57,33 @@ class QueuedRun:
 def measure(run: QueuedRun, data: Path, out: Path, finetune_steps: int) -> None:
     """Train a run, resuming from its checkpoint if there is one, and write its row into its folder.
 
+    A run that has a row only gets a fine-tuned file.
+
     Raises:
         HyrfError: the data set cannot be read, or a file cannot be written.
     """
     folder = run.folder(out)
     scene = load_variant(data, run.name)
+    if (folder / MEASUREMENT_FILE).exists():
+        row = json.loads((folder / MEASUREMENT_FILE).read_text())
+    else:
+        row = _train_and_measure(run, scene, folder)
+    if finetune_steps:
+        tuned = _compress_and_score(folder, scene, "compact", finetune_steps)
+        row["finetuned"] = {**tuned, "steps": finetune_steps}
+    (folder / MEASUREMENT_FILE).write_text(json.dumps(row, indent=1))
+
+
+def is_finished(folder: Path, finetune_steps: int) -> bool:
+    """Return whether a run has its row and, with `finetune_steps`, a file that was fine-tuned for so many steps."""
+    if not (folder / MEASUREMENT_FILE).exists():
+        return False
+    tuned = json.loads((folder / MEASUREMENT_FILE).read_text()).get("finetuned", {})
+    return not finetune_steps or tuned.get("steps") == finetune_steps
+
+
+def _train_and_measure(run: QueuedRun, scene: Scene, folder: Path) -> dict:
+    """Train a run unless its metrics are there, compress and score it, and return its row."""
     if not (folder / METRICS_FILE).exists():
         config = TrainConfig(steps=run.steps, seed=run.seed, exposure=run.exposure)
         resume = (folder / CHECKPOINT_FILE).exists()
@@ -70,7 +94,7 @@ def measure(run: QueuedRun, data: Path, out: Path, finetune_steps: int) -> None:
     metrics = json.loads((folder / METRICS_FILE).read_text())
     model = hyrfpack.load_model(folder / MODEL_FILE)
     training = hyrfpack.evaluate_model(model, evenly_spaced(scene.train, MAX_TRAINING_VIEWS_SCORED))
-    row = {
+    return {
         **asdict(run),
         "gains": metrics["settings"]["exposure"],
         "steps_taken": metrics["settings"]["steps"],
@@ -83,9 +107,6 @@ def measure(run: QueuedRun, data: Path, out: Path, finetune_steps: int) -> None:
         "paper": _compress_and_score(folder, scene, "paper"),
         "compact": _compress_and_score(folder, scene, "compact"),
     }
-    if finetune_steps:
-        row["finetuned"] = _compress_and_score(folder, scene, "compact", finetune_steps)
-    (folder / MEASUREMENT_FILE).write_text(json.dumps(row, indent=1))
 
 
 def _compress_and_score(folder: Path, scene: Scene, profile: str, finetune_steps: int | None = None) -> dict:
@@ -150,9 +171,7 @@ def main() -> None:
     if args.table:
         print(format_table(list(read_finished_rows(args.out))))
         return
-    names = args.sets or sorted(
-        folder.name for folder in args.data.iterdir() if (folder / "images").exists() or (folder / "train").exists()
-    )
+    names = args.sets or list_sets(args.data)
     queue = [
         QueuedRun(name, steps, seed, args.exposure)
         for steps in sorted(args.steps)
@@ -164,7 +183,7 @@ def main() -> None:
         lock = folder.with_name(f"{folder.name}.queue")  # training locks the folder itself
         try:
             with exclusive_folder(lock):
-                if (folder / MEASUREMENT_FILE).exists():
+                if is_finished(folder, args.finetune):
                     continue
                 started = time.strftime("%H:%M")
                 measure(run, args.data, args.out, args.finetune)
@@ -175,4 +194,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -14,6 +14,7 @@ import json
 from pathlib import Path
 
 import hyrfpack
+from tools.command import run_command
 from tools.studies.compare_versions import DEFAULT_SETS
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
@@ -67,4 +68,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -42,6 +42,7 @@ from hyrfpack.render import render_view
 from hyrfpack.render.renderer import RenderSettings
 from hyrfpack.render.surface import render_median_depth
 from hyrfpack.scene import Camera, Scene, evenly_spaced
+from tools.command import run_command
 from tools.tables import format_cell, markdown_table
 
 MESH_SAMPLES = 500_000
@@ -260,4 +261,4 @@ def statistics(values: np.ndarray) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -27,6 +27,7 @@ from hyrfpack.format import save_model
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.scene import Camera
+from tools.command import run_command
 from tools.tables import markdown_table
 
 BALL_RADIUS = 1.0
@@ -99,6 +100,13 @@ def make_cameras() -> list[Camera]:
     return cameras
 
 
+def surface_distances(points: np.ndarray) -> np.ndarray:
+    """Return the distances (N,) of points (N, 3) to the nearest ball or the disk."""
+    to_balls = np.abs(np.linalg.norm(points[:, None] - BALL_CENTERS, axis=2) - BALL_RADIUS).min(1)
+    beyond_edge = np.maximum(np.linalg.norm(points[:, :2], axis=1) - DISK_RADIUS, 0)
+    return np.minimum(to_balls, np.hypot(beyond_edge, points[:, 2]))
+
+
 def measure(model: Path, target: Path) -> list[str]:
     """Export a mesh in a process of its own; return its triangles, seconds, peak memory and errors."""
     command = [sys.executable, "-m", "hyrfpack", "export", str(model), "-o", str(target), "--overwrite"]
@@ -107,16 +115,15 @@ def measure(model: Path, target: Path) -> list[str]:
     _, status, usage = os.wait4(process.pid, 0)
     wall = time.perf_counter() - start
     if status:
-        return ["failed", f"{wall:.0f} s", "", f"{usage.ru_maxrss / 1e6:.2f} GB", ""]
+        return ["failed", f"{wall:.0f} s", "", f"{usage.ru_maxrss * 1024 / 1e9:.2f} GB", ""]
     mesh = trimesh.load(target, process=False)
     vertices = np.asarray(mesh.vertices)
-    to_balls = np.abs(np.linalg.norm(vertices[:, None] - BALL_CENTERS, axis=2) - BALL_RADIUS).min(1)
-    errors = 100 / BALL_RADIUS * np.minimum(to_balls, np.abs(vertices[:, 2]))
+    errors = 100 / BALL_RADIUS * surface_distances(vertices)
     cpu = usage.ru_utime + usage.ru_stime
-    memory = f"{usage.ru_maxrss / 1e6:.2f} GB"
+    memory = f"{usage.ru_maxrss * 1024 / 1e9:.2f} GB"
     found = f"{np.median(errors):.2f}, {np.quantile(errors, 0.95):.2f} %"
     return [f"{len(mesh.faces):,}", f"{wall:.0f} s", f"{cpu:.0f} s", memory, found]
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

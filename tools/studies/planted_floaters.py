@@ -24,6 +24,7 @@ from hyrfpack.edit.transform import replace_config
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.scene import Camera, evenly_spaced
+from tools.command import run_command
 from tools.studies.trained_runs import load_runs, make_runs_parser
 from tools.tables import markdown_table
 
@@ -136,4 +137,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

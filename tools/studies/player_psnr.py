@@ -25,10 +25,18 @@ import hyrfpack
 from hyrfpack.scene import Camera
 from tools.browser.browser import Browser
 from tools.browser.chromium import Chromium
-from tools.studies.web_player import PAGE_TIMEOUT_SECONDS, draw_in_page, open_page, psnr, read_from_page, stored_cameras
+from tools.command import run_command
+from tools.studies.web_player import (
+    EXACT_SETTINGS,
+    PAGE_TIMEOUT_SECONDS,
+    draw_in_page,
+    open_page,
+    psnr,
+    read_from_page,
+    stored_cameras,
+)
 from tools.tables import markdown_table
 
-EXACT_SETTINGS = hyrfpack.RenderSettings(background_threshold=0, transmittance_min=0)
 # From here on, pictures are those of frames at a part of the resolution, before they are enlarged, without what is
 # added at rest. The panorama has its final tiles in view, as after a rest at a view near this one. With
 # `hyrfpack.follows`, the background is evaluated for the view instead, as where the device is quick enough.
@@ -121,4 +129,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -29,6 +29,7 @@ from hyrfpack.poses.alignment import Poses, align_poses
 from hyrfpack.poses.job import Job
 from hyrfpack.poses.mapping import read_pieces
 from hyrfpack.poses.process import run_stage
+from tools.command import run_command
 from tools.cpu_time import children_cpu_seconds
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
@@ -157,4 +158,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -41,6 +41,7 @@ from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.trainer import Trainer
+from tools.command import run_command
 from tools.studies.train_sets import make_study_parser
 
 MLP_LOOKUPS = ("hyrfpack.model.field.mlp", "hyrfpack.ops.background.reference.mlp")
@@ -139,4 +140,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

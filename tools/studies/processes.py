@@ -17,6 +17,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from tools.command import run_command
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
@@ -75,4 +76,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

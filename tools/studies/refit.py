@@ -28,6 +28,7 @@ from hyrfpack.config.edit import DEFAULT_REFIT_STEPS
 from hyrfpack.config.train import LearningRates
 from hyrfpack.edit.refit import REFIT_RATES, refit, score_region
 from hyrfpack.model import HybridModel
+from tools.command import run_command
 from tools.studies.trained_runs import load_runs, make_runs_parser
 from tools.tables import markdown_table
 
@@ -113,4 +114,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -26,9 +26,10 @@ from PIL import Image
 
 import hyrfpack
 from hyrfpack.model import HybridModel
-from hyrfpack.scene import Camera, Picture, Scene, View
+from hyrfpack.scene import Camera, Picture, Scene, View, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.log import peak_memory
+from tools.command import run_command
 from tools.tables import markdown_table
 
 MAX_PHOTOS = 8
@@ -56,21 +57,22 @@ def scale_view(view: View, width: int, height: int) -> View:
 
 
 def measure_steps(scene: Scene, model: HybridModel, steps: int) -> dict:
-    """Train `steps` steps; return the median and the largest seconds of a step, and peak and added bytes."""
+    """Train `steps` steps; return the median seconds of a step, those with the round, and peak and added bytes."""
     density = DensityConfig(start=0.5, stop=0.5, peak=0.5, rounds=1)
     config = TrainConfig(
         steps=steps, resolution_schedule=False, max_gaussians=len(model), density=density, exposure=False
     )
     before = peak_memory() or 0
     trainer = Trainer(scene, config, model=model)
+    is_round = [trainer.strategy.acting(step) for step in range(1, steps + 1)]
     ends = [time.perf_counter()]
     trainer.run(progress=lambda _: ends.append(time.perf_counter()))
-    seconds = np.diff(ends)[2:]  # the first steps compile kernels
+    seconds = np.diff(ends)
     peak = peak_memory() or 0
     parts = {name: round(value / steps, 3) for name, value in sorted(trainer.seconds.items())}
     return {
-        "step": statistics.median(seconds),
-        "round": float(seconds.max()),
+        "step": statistics.median(seconds[2:]),  # the first steps compile kernels
+        "round": float(seconds[is_round].max()),
         "peak": peak,
         "added": peak - before,
         "parts": parts,
@@ -88,7 +90,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if options.one:
         scene = hyrfpack.load_scene(options.data)
-        views = [scale_view(view, *options.size) for view in scene.train[:: max(1, len(scene.train) // MAX_PHOTOS)]]
+        views = [scale_view(view, *options.size) for view in evenly_spaced(scene.train, MAX_PHOTOS)]
         model = resample_gaussians(hyrfpack.load_model(options.model), options.gaussians[0])
         print(json.dumps(measure_steps(dataclasses.replace(scene, train=views, test=[]), model, options.steps)))
         return
@@ -115,4 +117,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

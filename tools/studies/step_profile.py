@@ -70,6 +70,7 @@ from hyrfpack.render import Rendering, render_view
 from hyrfpack.scene import Camera, Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.resolution import background_stride
+from tools.command import run_command
 from tools.gpu.roofline import Work
 from tools.gpu.scene import count_blended, decode_splats
 from tools.gpu.timing import Rates
@@ -479,4 +480,4 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

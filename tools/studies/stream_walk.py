@@ -33,6 +33,7 @@ import hyrfpack
 from hyrfpack.cameras.files import camera_from_numbers, camera_to_json
 from hyrfpack.scene import Camera, evenly_spaced
 from tools.browser.chromium import Chromium
+from tools.command import run_command
 from tools.studies.large_model import COUNT_TEXTURES_SCRIPT
 from tools.studies.scene_page import serve_scene
 from tools.studies.web_player import PAGE_TIMEOUT_SECONDS, stored_cameras
@@ -153,4 +154,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

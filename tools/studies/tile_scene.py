@@ -27,6 +27,7 @@ from hyrfpack.format.scene_manifest import MANIFEST_NAME, Chunk, ChunkLevel, Sce
 from hyrfpack.format.sections import METADATA, SECTION_CONTENTS
 from hyrfpack.format.shared import CODEC_SHARED, refer_to_section
 from hyrfpack.format.versions import lowest_minor_version
+from tools.command import run_command
 
 
 def list_offsets(copies: int, first: np.ndarray, second: np.ndarray) -> list[np.ndarray]:
@@ -98,4 +99,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

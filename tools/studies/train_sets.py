@@ -22,12 +22,28 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import hyrfpack
+from hyrfpack.errors import HyrfError
 from hyrfpack.train import TrainConfig
+from tools.command import run_command
 from tools.studies.set_variants import load_variant
 from tools.tables import markdown_table
 
 COMPRESSED_PROFILES = ("paper", "compact")
 DATA_FOLDER = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[3] / "shared" / "data")
+
+
+def list_sets(data: Path) -> list[str]:
+    """Return the names of all data sets in a folder, sorted.
+
+    Raises:
+        HyrfError: there is no data set.
+    """
+    folders = sorted(data.iterdir()) if data.is_dir() else []
+    names = [folder.name for folder in folders if (folder / "images").exists() or (folder / "train").exists()]
+    if not names:
+        fix = "name the folder of the data sets with `data`, or in the environment variable HYRFPACK_DATA"
+        raise HyrfError(f"{data}: there are no data sets", fix=fix)
+    return names
 
 
 def has_run(out: Path, config: TrainConfig) -> bool:
@@ -134,9 +150,7 @@ def main() -> None:
     parser.add_argument("--reuse", action="store_true", help="do not repeat runs that --out has with these settings")
     args = parser.parse_args()
     out = args.out or Path("runs/sets") / str(args.steps)
-    names = args.sets or sorted(
-        folder.name for folder in args.data.iterdir() if (folder / "images").exists() or (folder / "train").exists()
-    )
+    names = args.sets or list_sets(args.data)
     warnings.simplefilter("error")  # a run that warns is a failure
     config = TrainConfig(steps=args.steps, seed=args.seed, exposure=args.exposure)
     rows = []
@@ -149,4 +163,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import hyrfpack
+from hyrfpack.errors import HyrfError
 from hyrfpack.format.run_folder import MODEL_FILE
 from hyrfpack.scene import Scene
 from tools.studies.train_sets import DATA_FOLDER
@@ -29,14 +30,17 @@ def load_runs(runs: Path, data: Path, names: Sequence[str] | None = None) -> Ite
         names: the data sets; None for all folders below `runs`.
 
     Raises:
-        FileNotFoundError: a data set has no run.
-        ValueError: a data set has several runs, such as those of two versions.
+        HyrfError: a data set has no run, or several, such as those of two versions.
     """
+    if not runs.is_dir():
+        raise HyrfError(f"{runs}: there is no such folder", fix="make runs with tools.studies.train_sets")
     for name in names or sorted(path.name for path in runs.iterdir() if path.is_dir()):
         model_files = sorted((runs / name).glob(f"**/{MODEL_FILE}"))
         if not model_files:
-            raise FileNotFoundError(f"{runs / name}: no run with a {MODEL_FILE}")
+            fix = "make one with tools.studies.train_sets"
+            raise HyrfError(f"{runs / name}: there is no run with a {MODEL_FILE}", fix=fix)
         if len(model_files) > 1:
             folders = ", ".join(str(path.parent.relative_to(runs)) for path in model_files)
-            raise ValueError(f"{runs}: several runs of {name}: {folders}; give a folder with one run for each data set")
+            fix = "name a folder with one run for each data set"
+            raise HyrfError(f"{runs}: there are several runs of {name}: {folders}", fix=fix)
         yield name, model_files[0], hyrfpack.load_scene(data / name)

@@ -25,9 +25,11 @@ from scipy import ndimage
 import hyrfpack
 from hyrfpack.data.pictures import PhotoFile
 from hyrfpack.data.undistort import undistort
+from hyrfpack.errors import HyrfError
 from hyrfpack.poses.frames import RECORD_NAME, FrameReport, choose_frames
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train import TrainConfig
+from tools.command import run_command
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
@@ -57,6 +59,8 @@ def main() -> None:
     rows = []
     for name in args.sets:
         out = args.out / name
+        if not (args.data / name / "images").is_dir():
+            raise HyrfError(f"{args.data / name}: there is no folder images", fix="name the data sets with `data`")
         photos = sorted((args.data / name / "images").iterdir())
         kinds = write_video(out / "clip.mp4", photos, args.lengths, args.quality, args.seed)
         started = time.perf_counter()
@@ -202,4 +206,4 @@ def _replace_by_photo(view: View, photo: Path) -> View:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

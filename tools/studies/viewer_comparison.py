@@ -51,6 +51,8 @@ from hyrfpack.cameras.files import camera_to_json
 from hyrfpack.cameras.paths import look_at
 from hyrfpack.scene import Camera
 from tools.browser.chromium import Chromium
+from tools.command import run_command
+from tools.studies.web_player import EXACT_SETTINGS, psnr
 from tools.tables import format_cell, markdown_table
 
 WINDOW_SIZE = (1280, 800)
@@ -58,8 +60,6 @@ VERTICAL_FOV_DEGREES = 50.0
 FILE_UP = np.array([0.0, -1.0, 0.0])  # the up direction that viewers expect in files of splats
 FIRST_PICTURE_DETAIL = 0.5  # share of the standard deviation of the final picture's pixels
 SAME_PICTURE_DB = 40.0  # of two frames of the screen recording, whose pictures are scaled down
-# Settings without any approximation.
-EXACT_SETTINGS = hyrfpack.RenderSettings(background_threshold=0, transmittance_min=0)
 STILL_SECONDS = 8.0  # a page whose screen has not changed for this long is complete
 PAGE_TIMEOUT_SECONDS = 300.0
 ORBIT_SECONDS = 6.0
@@ -73,7 +73,8 @@ OBSERVER_SCRIPT = """
   window.drawnFrames = 0;
   window.longTasks = [];
   new PerformanceObserver((list) => {
-    for (const { duration } of list.getEntries()) window.longTasks.push(duration);
+    for (const { startTime, duration } of list.getEntries())
+      window.longTasks.push([(performance.timeOrigin + startTime) / 1000, duration]);
   }).observe({ type: "longtask", buffered: true });
   let hasDrawn = false;
   for (const name of ["drawArrays", "drawElements", "drawArraysInstanced", "drawElementsInstanced"]) {
@@ -287,11 +288,6 @@ def bundle_script(script: str, path: Path, viewers: Path) -> None:
     )
 
 
-def psnr(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the PSNR in dB of two pictures in [0, 1]."""
-    return float(-10 * np.log10(max(np.mean((first - second) ** 2), 1e-12)))
-
-
 def decode_png(data: bytes) -> np.ndarray:
     """Return (H, W, 3) in [0, 1]."""
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), np.float32) / 255
@@ -333,7 +329,8 @@ def visit(site: Site, folder: Path, viewer: Viewer, reference: np.ndarray) -> tu
         if errors := browser.list_errors():
             raise SystemExit(f"{viewer.name}: {errors}")
         picture = browser.screenshot()
-        tasks = browser.evaluate("window.longTasks")
+        starts_and_ms = browser.evaluate("window.longTasks")
+        tasks = [ms for start, ms in starts_and_ms if start < opened + complete]
         heap = browser.collect_garbage()
         browser.evaluate(viewer.prepare)
         frame_ms = measure_frame_cpu_ms(browser)
@@ -410,4 +407,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

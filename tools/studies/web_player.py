@@ -25,21 +25,26 @@ import numpy as np
 import hyrfpack
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.files import camera_to_json
+from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from tools.browser.browser import Browser
 from tools.browser.chromium import Chromium
+from tools.command import run_command
+from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
 COMPARED_VIEWS = 8
 WINDOW_SIZE = (1280, 800)
 ORBIT_SECONDS = 6.0  # frames are counted for this long
 PAGE_TIMEOUT_SECONDS = 900.0
+# Settings without any approximation.
+EXACT_SETTINGS = hyrfpack.RenderSettings(background_threshold=0, transmittance_min=0)
 READ_PIXELS_SCRIPT = "btoa(Array.from(hyrfpack.pixels(), (byte) => String.fromCharCode(byte)).join(''))"
 
 
 def psnr(first: np.ndarray, second: np.ndarray) -> float:
     """Return the PSNR in dB of two pictures in [0, 1]."""
-    return float(-10 * np.log10(max(np.mean((first - second) ** 2), 1e-12)))
+    return psnr_from_mse(float(np.mean((first - second) ** 2)))
 
 
 def stored_cameras(model: Path, count: int) -> list[Camera]:
@@ -145,7 +150,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=Path, help="folder of runs, written by tools.studies.train_sets")
     parser.add_argument("--sets", nargs="*", help="data sets to compare (all)")
-    parser.add_argument("--data", type=Path, help="folder of the data sets")
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
     parser.add_argument("--large", type=Path, nargs="*", default=[], help="models to time")
     parser.add_argument("--repeats", type=int, default=3, help="number of repeats of each time (3)")
     arguments = parser.parse_args()
@@ -165,4 +170,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -11,7 +11,8 @@ Vulkan), in a window of 1280 x 800. When the picture is complete, it measures:
 - sort: ms until an order for a view is there: in the worker and back, or on the device
 - PSNR: of both renderers' pictures of the window, in dB
 
-Times are medians. They need an otherwise idle machine.
+Times of colours, frames and sorts are medians over --repeats; those until the picture is complete come from one visit.
+They need an otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ import numpy as np
 import hyrfpack
 from tools.browser.build_package import build_package
 from tools.browser.chromium import WEBGPU_FLAGS, Chromium
+from tools.command import run_command
 from tools.studies.viewer_comparison import WINDOW_SIZE, Site
+from tools.studies.web_player import psnr
 from tools.tables import markdown_table
 
 TIMEOUT_SECONDS = 900
@@ -120,11 +123,11 @@ def main() -> None:
                 for kind in ("webgl", "webgpu"):
                     row, pixels = measure(site.address, kind, arguments.repeats, count)
                     rows.append([f"{count:,}", kind, *row, ""])
-                    pictures.append(pixels.astype(np.float64))
-            rows[-1][-1] = f"{10 * np.log10(255**2 / max(np.mean((pictures[0] - pictures[1]) ** 2), 1e-9)):.1f}"
+                    pictures.append(pixels / 255)
+            rows[-1][-1] = f"{psnr(*pictures):.1f}"
     columns = ["complete, s", "CPU, s", "colours, us", "frame, ms", "sort, ms", "PSNR, dB"]
     print(markdown_table(["Gaussians", "renderer", *columns], rows))
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

@@ -1,0 +1,84 @@
+"""Command lines of the tools: all answer --help, and errors that the user can correct are one line."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hyrfpack.errors import HyrfError
+from tools.command import run_command
+from tools.studies import export_table, mesh_scale
+from tools.studies.train_sets import list_sets
+
+REPOSITORY_ROOT = Path(__file__).parents[2]
+TEXTS = {
+    ".".join(path.relative_to(REPOSITORY_ROOT).with_suffix("").parts): text
+    for path in sorted((REPOSITORY_ROOT / "tools").rglob("*.py"))
+    if "def main(" in (text := path.read_text("utf-8")) and ".parse_args(" in text
+}
+CHANGES_ENVIRONMENT = {module for module, text in TEXTS.items() if "\nos.environ" in text}
+
+
+@pytest.mark.parametrize("module", sorted(TEXTS.keys() - CHANGES_ENVIRONMENT))
+def test_every_tool_answers_help(module: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setattr(sys, "argv", [module, "--help"])
+    with pytest.raises(SystemExit) as exit_info:
+        importlib.import_module(module).main()
+    assert exit_info.value.code in (None, 0) and "usage:" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("module", sorted(CHANGES_ENVIRONMENT))
+def test_a_tool_that_changes_the_environment_answers_help(module: str):
+    """It runs in a process of its own, because Triton's interpreter would else be off for later tests."""
+    process = subprocess.run([sys.executable, "-m", module, "--help"], cwd=REPOSITORY_ROOT, stdout=subprocess.PIPE)
+    assert process.returncode == 0 and b"usage:" in process.stdout
+
+
+def test_an_error_that_the_user_can_correct_is_one_line_with_options(capsys: pytest.CaptureFixture[str]):
+    def fail() -> None:
+        raise HyrfError("photos: there are no data sets", fix="name the folder with `data`")
+
+    with pytest.raises(SystemExit) as exit_info:
+        run_command(fail)
+    assert exit_info.value.code == 2
+    assert capsys.readouterr().err == "error: photos: there are no data sets; name the folder with --data\n"
+
+
+@pytest.mark.parametrize("code", [None, 0, 1])
+def test_a_tool_exits_with_its_code(code: int | None):
+    with pytest.raises(SystemExit) as exit_info:
+        run_command(lambda: code)
+    assert exit_info.value.code == code
+
+
+def test_data_sets_are_folders_with_photos(tmp_path: Path):
+    for name in ("b/images", "a/train", "empty"):
+        (tmp_path / name).mkdir(parents=True)
+    assert list_sets(tmp_path) == ["a", "b"]
+
+
+@pytest.mark.parametrize("name", ["missing", "empty"])
+def test_a_folder_without_data_sets_is_refused(name: str, tmp_path: Path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(HyrfError, match=f"{name}: there are no data sets; .*HYRFPACK_DATA"):
+        list_sets(tmp_path / name)
+
+
+def test_an_unknown_format_is_refused_before_anything_is_read(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(sys, "argv", ["export_table", "missing.hyrf", "missing", "--formats", "ply", "foo"])
+    with pytest.raises(SystemExit):
+        export_table.main()
+    error = capsys.readouterr().err
+    assert "--formats .foo: there is no such format" in error and ".spz v3" in error
+
+
+def test_distances_to_the_disk_end_at_its_edge():
+    points = np.array([[4.9, 0.0, 0.1], [8.0, 0.0, 4.0], [0.0, 0.0, 2.5]])
+    np.testing.assert_allclose(mesh_scale.surface_distances(points), [0.1, 5.0, 0.5])
