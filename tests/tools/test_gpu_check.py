@@ -599,6 +599,18 @@ def test_a_full_run_reports_at_intervals_and_resumes_from_its_checkpoint(
     assert list(tmp_path.glob("*.checkpoint")) == []
 
 
+def test_a_full_run_does_not_resume_the_checkpoint_of_another_commit(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    setup = replace(TINY_SETUP, device="cpu", data=str(data), full_run_steps=6, full_run_seconds=0.0)
+    steps = []
+    for commit in ("a", "b", "a"):
+        (row,) = gpu_full_run.run(str(data), replace(setup, full_run_interval=0.0, commit=commit))
+        steps.append(row["step"])
+    assert steps == ["1 of 6", "1 of 6", "2 of 6"]
+
+
 def test_a_full_run_needs_a_data_set() -> None:
     (item,) = gpu_full_run.items(TINY_SETUP)
     (row,) = gpu_full_run.run(item, TINY_SETUP)

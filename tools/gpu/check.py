@@ -155,6 +155,7 @@ def main(arguments: list[str] | None = None) -> int:
     if args.long:
         setup = replace(setup, step_seconds=3 * setup.step_seconds, quality_seconds=3 * setup.quality_seconds)
     facts = describe_gpu_machine(setup.torch_device, args.commit)
+    setup = replace(setup, commit=str(facts["commit"]))
     print(format_machine(facts), flush=True)
 
     def report(rows: Sequence[Row]) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 import time
 from collections.abc import Iterator
@@ -24,7 +25,7 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
     """Yield a row after each `full_run_interval` seconds of training, until `full_run_seconds` or the last step.
 
     Each interval ends with a checkpoint in the folder for temporary files, from which a later call on this machine
-    resumes.
+    of the same commit resumes.
     """
     if setup.data is None:
         yield {"table": TABLE_NAME, "status": "left out", "note": "name a real data set with --data"}
@@ -36,7 +37,9 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
     end = time.perf_counter() + setup.full_run_seconds
     scene = load_scene(item)
     trainer = Trainer(scene, TrainConfig(steps=setup.full_run_steps), device=setup.torch_device)
-    checkpoint = Path(tempfile.gettempdir(), f"hyrfpack-gpu-{Path(item).name}-{setup.full_run_steps}.checkpoint")
+    commit = re.sub(r"[^\w.-]", "_", setup.commit)
+    name = f"hyrfpack-gpu-{Path(item).name}-{setup.full_run_steps}-{commit}.checkpoint"
+    checkpoint = Path(tempfile.gettempdir(), name)
     if checkpoint.exists():
         trainer.load(checkpoint)
     ended = False

@@ -45,6 +45,7 @@ class Setup:
         test_paths: files and folders of the tests that pytest runs, relative to the repository's root.
         data: folder of a real data set, or None.
         logs: folder for what other programs print, or None.
+        commit: the commit that is checked.
     """
 
     device: str = "cuda"
@@ -74,6 +75,7 @@ class Setup:
     test_paths: tuple[str, ...] = ("tests/ops", "tests/test_gpu_path.py")
     data: str | None = None
     logs: str | None = None
+    commit: str = ""
 
     @property
     def torch_device(self) -> torch.device:
