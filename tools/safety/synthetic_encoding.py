@@ -6,6 +6,7 @@ Golden files, recorded sizes, hostile files and tests use this module, so that t
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from unittest.mock import patch
 
@@ -51,8 +52,12 @@ def draw_sensitivity(model: HybridModel) -> Sensitivity:
         model.decode_geometry().opacities.detach().double().numpy(), TOTAL_LOGIT_SENSITIVITY * shares
     )
     explicit = TOTAL_LOGIT_SENSITIVITY * shares
-    residuals = () if model.config.residual_degree is None else (explicit[:, None].repeat(SHAPE_RESIDUALS, 1), explicit)
-    return Sensitivity(TOTAL_POSITION_SENSITIVITY * shares, *[explicit] * 3, removals, fields, *residuals)
+    sensitivity = Sensitivity(
+        TOTAL_POSITION_SENSITIVITY * shares, explicit, explicit, explicit, removals=removals, fields=fields
+    )
+    if model.config.residual_degree is None:
+        return sensitivity
+    return replace(sensitivity, shapes=explicit[:, None].repeat(SHAPE_RESIDUALS, 1), harmonics=explicit)
 
 
 def quantize_with_drawn_sensitivity(
@@ -76,7 +81,9 @@ def quantize_uniformly(model: HybridModel, step: float) -> QuantizedModel:
     arrays = to_arrays(model)
     ones = {group: np.ones(values.size) for group, values in arrays.items()}
     distortion = step**2 / 12 * sum(values.size for values in arrays.values())
-    return plan_and_quantize(model, Sensitivity(*np.ones((5, len(model))), ones), distortion, prune=False)
+    one = np.ones(len(model))
+    sensitivity = Sensitivity(one, one, one, one, removals=one, fields=ones)
+    return plan_and_quantize(model, sensitivity, distortion, prune=False)
 
 
 def encode(model: HybridModel, profile: str, provenance: dict | None = None, **settings: object) -> bytes:
