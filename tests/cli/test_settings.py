@@ -75,7 +75,8 @@ def test_a_value_outside_the_limits_of_a_setting_is_a_usage_error(config_class, 
 
 def test_the_help_has_the_description_the_unit_and_the_default():
     text = " ".join(hyrfpack("train", "--help").stdout.split())
-    assert "--max-gaussians N Budget: the number of Gaussians in the end, at most. [default: measured by pilot runs] [x>=1]" in text
+    budget = "Budget: the number of Gaussians in the end, at most."
+    assert f"--max-gaussians N {budget} [default: measured by pilot runs] [x>=1]" in text
     export = " ".join(hyrfpack("export", "--help").stdout.split())
     assert "--spz-version 3|4 Version of .spz files" in export and "[default: 4; 3<=x<=4]" in export
     assert "--sh-degree 0-3 Highest degree" in " ".join(hyrfpack("convert", "--help").stdout.split())
