@@ -19,7 +19,7 @@ from threading import Lock, Thread
 _LOG = logging.getLogger(__name__)
 
 CONNECT_SECONDS = 60.0
-# A process sends its token and rank as soon as it is connected. Others are not waited for.
+# A process sends its token and rank as soon as it is connected. A connection without them is closed after this time.
 GREETING_SECONDS, MAX_GREETING_BYTES = 5.0, 64
 # A machine that is switched off closes no connection. The system then sends probes: the first after 30 s without data,
 # and after 6 of them without an answer, 10 s apart, the connection counts as closed.

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Callable, Container, Hashable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from hyrfpack.outputs import PICTURE_SUFFIXES
 from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.survey.measure import PIXELS_PROGRESS, PhotoMeasurement, relative_name
+
+Key = TypeVar("Key", bound=Hashable)
 
 _MIN_RECOMMENDED_PHOTOS = 20  # fewer photos hardly show an object from all sides
 _MAX_EXPOSURE_SPREAD_STOPS = 2.5  # between the 5 % and 95 % quantiles; real sets at one exposure have up to 2
@@ -73,7 +76,7 @@ def find_copy_problems(
     if len(measurements) > 2 and np.abs(thumbnails - thumbnails[0]).mean(axis=(1, 2)).max() < _SAME_PICTURE_MAX_LEVELS:
         return ["all photos show the same picture; walk around and take photos from many places"]
     readable = [photo for photo in photos if relative_name(photo, folder) not in unreadable]
-    same_size = [group for group in _group_files(readable, lambda photo: photo.stat().st_size) if len(group) > 1]
+    by_size = _group_files(readable, lambda photo: photo.stat().st_size)
     middle = (PIXELS_PROGRESS + 1) / 2
 
     def follow(files: list[Path], start: float, end: float) -> Iterator[Path]:
@@ -82,20 +85,20 @@ def find_copy_problems(
             report_progress(TaskEvent(compared, start + (end - start) * done / len(files)))
             yield file
 
-    same_samples = _group_files(
-        follow([photo for group in same_size for photo in group], PIXELS_PROGRESS, middle),
+    by_samples = _group_files(
+        follow([photo for group in by_size.values() if len(group) > 1 for photo in group], PIXELS_PROGRESS, middle),
         lambda photo: (photo.stat().st_size, _digest_samples(photo)),
     )
     to_hash: list[Path] = []
     not_hashed: list[list[Path]] = []
-    for group in same_samples:
-        is_compared = group[0].stat().st_size <= 3 * _SAMPLE_BYTES
+    for (size, _), group in by_samples.items():
+        is_compared = size <= 3 * _SAMPLE_BYTES
         if len(group) > 1 and not is_compared and len(to_hash) + len(group) <= _MAX_HASHED_PHOTOS:
             to_hash += group
         else:
             not_hashed.append(group)
     hashed = _group_files(follow(to_hash, middle, 1.0), lambda photo: hashlib.sha256(photo.read_bytes()).digest())
-    copies = [(photo, first) for first, *others in hashed + not_hashed for photo in others]
+    copies = [(photo, first) for first, *others in [*hashed.values(), *not_hashed] for photo in others]
     if not copies:
         return []
     first, of = (relative_name(item, folder) for item in copies[0])
@@ -105,13 +108,13 @@ def find_copy_problems(
     ]
 
 
-def _group_files(files: Iterable[Path], describe: Callable[[Path], Hashable]) -> list[list[Path]]:
+def _group_files(files: Iterable[Path], describe: Callable[[Path], Key]) -> dict[Key, list[Path]]:
     """Group the files that `describe` gives the same value, and leave out those that cannot be read."""
-    groups: dict[Hashable, list[Path]] = {}
+    groups: dict[Key, list[Path]] = {}
     for file in files:
         with suppress(OSError):  # of large sets, some photos have not been opened before
             groups.setdefault(describe(file), []).append(file)
-    return list(groups.values())
+    return groups
 
 
 def _digest_samples(file: Path) -> bytes:

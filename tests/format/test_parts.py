@@ -28,7 +28,7 @@ from tools.safety.make_golden import GOLDEN_MERGED_FILE, GOLDEN_PARTS, GOLDEN_SC
 
 GOLDEN_FOLDER = Path(__file__).parents[1] / "golden"
 PAPER, COMPACT = ((GOLDEN_FOLDER / name).read_bytes() for name in ("v1.0_paper.hyrf", "v1.2_compact_exposure.hyrf"))
-CHUNK = (GOLDEN_SCENE_FOLDER / "chunk-0000-0.hyrf").read_bytes()
+CHUNK_BYTES = (GOLDEN_SCENE_FOLDER / "chunk-0000-0.hyrf").read_bytes()
 NAMES = ["room", "a chair, caf\u00e9"]
 MERGED = encode_parts(list(zip(NAMES, (PAPER, COMPACT), strict=True)))
 
@@ -169,7 +169,7 @@ FORGED_FILES = {
     "a part is a merged file": with_sections(part(MERGED)),
     "a part is no file": with_sections(part(b"nothing")),
     "a part is cut": with_sections(part(COMPACT[:-8])),
-    "a part refers to another file": with_sections(part(CHUNK)),
+    "a part refers to another file": with_sections(part(CHUNK_BYTES)),
     "a part has another codec": with_sections(part(COMPACT, codec=5)),
     "a part has another raw length": with_sections(part(COMPACT, raw_length=len(COMPACT) + 1)),
     "names are no object": with_sections(names_section(NAMES)),

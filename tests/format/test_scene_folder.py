@@ -20,7 +20,7 @@ from hyrfpack.format import describe_file, load_model
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
 from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
 
-METHODS = [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]
+ZIP_METHODS = [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]
 
 
 def write_zip(path: Path, method: int, changed: dict[str, bytes] | None = None) -> Path:
@@ -34,10 +34,10 @@ def write_zip(path: Path, method: int, changed: dict[str, bytes] | None = None) 
 @pytest.fixture(scope="module")
 def archives(tmp_path_factory) -> list[bytes]:
     folder = tmp_path_factory.mktemp("archives")
-    return [write_zip(folder / "scene.zip", method).read_bytes() for method in METHODS]
+    return [write_zip(folder / "scene.zip", method).read_bytes() for method in ZIP_METHODS]
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ZIP_METHODS)
 def test_an_archive_of_any_method_is_read_like_the_folder(tmp_path, method):
     archive = write_zip(tmp_path / "scene.zip", method)
 

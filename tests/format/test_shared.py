@@ -21,7 +21,7 @@ from tools.safety import minimal_reader
 from tools.safety.make_golden import GOLDEN_FOLDER, GOLDEN_SCENE_FOLDER
 
 CHUNK_NAME, SHARED_NAME = "chunk-0000-0.hyrf", "shared.hyrf"
-NOTE = Section("NOTE", 0, b"any bytes", 9, required=False)
+UNKNOWN_SECTION = Section("NOTE", 0, b"any bytes", 9, required=False)
 MODEL_PATHS = [GOLDEN_FOLDER / f"{name}.hyrf" for name in ("v1.0_paper", "v1.2_compact_exposure")]
 
 
@@ -81,7 +81,7 @@ def test_a_table_whose_groups_depend_on_points_cannot_be_referred_to(chunk):
 @pytest.mark.parametrize("path", MODEL_PATHS, ids=lambda path: path.stem)
 def test_a_file_with_an_unknown_optional_section_gets_other_metadata(path):
     sections = read_container(path.read_bytes()).sections
-    container = read_container(write_container([*sections, NOTE], MINOR_VERSION), SECTION_CONTENTS)
+    container = read_container(write_container([*sections, UNKNOWN_SECTION], MINOR_VERSION), SECTION_CONTENTS)
 
     data = with_metadata(container, read_config(container), {"note": "moved"})
 
@@ -90,7 +90,7 @@ def test_a_file_with_an_unknown_optional_section_gets_other_metadata(path):
 
 
 def test_a_chunk_with_an_unknown_optional_section_gets_copies_of_what_it_shares(chunk):
-    write_sections(chunk, [*read_container(chunk.read_bytes()).sections, NOTE])
+    write_sections(chunk, [*read_container(chunk.read_bytes()).sections, UNKNOWN_SECTION])
 
     with Container.open(chunk, SECTION_CONTENTS) as container:
         chunk.with_name("alone.hyrf").write_bytes(self_contained_bytes(container))
@@ -101,7 +101,7 @@ def test_a_chunk_with_an_unknown_optional_section_gets_copies_of_what_it_shares(
 
 def test_files_with_an_unknown_optional_section_are_merged_and_moved(tmp_path):
     for path in MODEL_PATHS:
-        write_sections(tmp_path / path.name, [*read_container(path.read_bytes()).sections, NOTE])
+        write_sections(tmp_path / path.name, [*read_container(path.read_bytes()).sections, UNKNOWN_SECTION])
     sources = [tmp_path / path.name for path in MODEL_PATHS]
 
     report = merge_models(sources, tmp_path / "both.hyrf", {sources[1].stem: [Scale(2.0)]})

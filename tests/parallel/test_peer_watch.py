@@ -10,7 +10,7 @@ import pytest
 
 from hyrfpack.parallel import peer_watch
 
-TOKEN = "0123456789abcdef"
+GROUP_TOKEN = "0123456789abcdef"
 
 
 def accept_after(*greetings: bytes) -> dict[int, socket.socket]:
@@ -26,7 +26,7 @@ def accept_after(*greetings: bytes) -> dict[int, socket.socket]:
                     pass
 
         Thread(target=send, daemon=True).start()
-        connections = peer_watch._accept(server, 2, TOKEN)
+        connections = peer_watch._accept(server, 2, GROUP_TOKEN)
         for connection in (*clients, *connections.values()):
             connection.close()
         return connections
@@ -39,18 +39,18 @@ def accept_after(*greetings: bytes) -> dict[int, socket.socket]:
         b"x" * 1_000_000,
         b"\n",
         b"wrong 1\n",
-        TOKEN.encode() + b" 7\n",
-        TOKEN.encode() + b" \xb2\n",
+        GROUP_TOKEN.encode() + b" 7\n",
+        GROUP_TOKEN.encode() + b" \xb2\n",
     ],
     ids=["TLS", "endless", "empty", "token", "rank", "digit"],
 )
 def test_foreign_clients_are_dropped_and_the_peer_is_accepted(foreign, monkeypatch):
     monkeypatch.setattr(peer_watch, "GREETING_SECONDS", 0.2)
-    assert list(accept_after(foreign, f"{TOKEN} 1\n".encode())) == [1]
+    assert list(accept_after(foreign, f"{GROUP_TOKEN} 1\n".encode())) == [1]
 
 
 def test_a_silent_client_does_not_delay_the_peer_for_long(monkeypatch):
     monkeypatch.setattr(peer_watch, "GREETING_SECONDS", 0.2)
     start = time.monotonic()
-    assert list(accept_after(b"", f"{TOKEN} 1\n".encode())) == [1]
+    assert list(accept_after(b"", f"{GROUP_TOKEN} 1\n".encode())) == [1]
     assert time.monotonic() - start < peer_watch.CONNECT_SECONDS / 2

@@ -27,7 +27,7 @@ from tools.studies.mesh_error import demo_depth, nearest_surface
 RAW_FILE = Path(__file__).parents[1] / "golden" / "trained" / "demo.hyrf"
 CAMERA = Camera(40, 30, 35.0, 38.0, 18.0, 16.0, np.eye(4))
 
-SETTINGS = RenderSettings().raster_settings(antialiased=False)
+RASTER_SETTINGS = RenderSettings().raster_settings(antialiased=False)
 
 
 def rays_of(camera: Camera) -> np.ndarray:
@@ -138,7 +138,7 @@ def test_where_gaussians_are_too_faint_there_is_neither_depth_nor_normal():
     gaussians = sheet(np.array([0.0, 0.0, 1.0]), count=40, half=0.2)
     camera = camera_at((0, 0, 3), up=(0, 1, 0), width=48, height=48, focal=30.0)
     frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
-    depth, normals = render_surface(gaussians, frame, camera, SETTINGS, normals=True)
+    depth, normals = render_surface(gaussians, frame, camera, RASTER_SETTINGS, normals=True)
     assert normals is not None and 0 < (depth > 0).sum() < depth.numel()
     assert bool((normals[depth == 0] == 0).all()) and bool((normals[depth > 0].norm(dim=-1) > 0.99).all())
 
@@ -148,7 +148,7 @@ def test_round_gaussians_take_their_normals_from_depth():
     gaussians = gaussians._replace(scales=torch.full((len(gaussians.means), 3), 0.1))
     camera = camera_at((1, 0.5, 4), up=(0, 1, 0), width=48, height=48, focal=80.0)
     frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
-    _, normals = render_surface(gaussians, frame, camera, SETTINGS, normals=True)
+    _, normals = render_surface(gaussians, frame, camera, RASTER_SETTINGS, normals=True)
     assert normals is not None
     assert np.median(angles(normals.numpy(), np.array([0.0, 0.0, 1.0]))) < 10
 

@@ -16,15 +16,15 @@ from tools.studies import export_table, mesh_scale
 from tools.studies.train_sets import list_sets
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
-TEXTS = {
+SOURCE_BY_MODULE = {
     ".".join(path.relative_to(REPOSITORY_ROOT).with_suffix("").parts): text
     for path in sorted((REPOSITORY_ROOT / "tools").rglob("*.py"))
     if "def main(" in (text := path.read_text("utf-8")) and ".parse_args(" in text
 }
-CHANGES_ENVIRONMENT = {module for module, text in TEXTS.items() if "\nos.environ" in text}
+CHANGES_ENVIRONMENT = {module for module, text in SOURCE_BY_MODULE.items() if "\nos.environ" in text}
 
 
-@pytest.mark.parametrize("module", sorted(TEXTS.keys() - CHANGES_ENVIRONMENT))
+@pytest.mark.parametrize("module", sorted(SOURCE_BY_MODULE.keys() - CHANGES_ENVIRONMENT))
 def test_every_tool_answers_help(module: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     monkeypatch.setattr(sys, "argv", [module, "--help"])
     with pytest.raises(SystemExit) as exit_info:

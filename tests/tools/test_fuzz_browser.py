@@ -10,14 +10,14 @@ import pytest
 from tools.safety import fuzz_browser
 from tools.safety.fuzz_browser import Verdict, find_disagreement, read_in_javascript, read_in_python
 
-POSITIONS, BOTH = {"POSI": "1"}, {"POSI": "1", "COLO": "2"}
+ONE_GROUP, TWO_GROUPS = {"POSI": "1"}, {"POSI": "1", "COLO": "2"}
 
 
 def test_groups_that_only_one_reader_has_are_a_disagreement():
-    assert find_disagreement(Verdict(BOTH), Verdict(BOTH)) == ""
-    assert find_disagreement(Verdict(BOTH), Verdict(POSITIONS)) == "only one reader has COLO"
-    assert find_disagreement(Verdict(POSITIONS), Verdict(BOTH)) == "only one reader has COLO"
-    assert find_disagreement(Verdict(BOTH), Verdict(BOTH | {"COLO": "3"})) == "different numbers in COLO"
+    assert find_disagreement(Verdict(TWO_GROUPS), Verdict(TWO_GROUPS)) == ""
+    assert find_disagreement(Verdict(TWO_GROUPS), Verdict(ONE_GROUP)) == "only one reader has COLO"
+    assert find_disagreement(Verdict(ONE_GROUP), Verdict(TWO_GROUPS)) == "only one reader has COLO"
+    assert find_disagreement(Verdict(TWO_GROUPS), Verdict(TWO_GROUPS | {"COLO": "3"})) == "different numbers in COLO"
 
 
 def test_an_exception_of_a_reader_is_a_disagreement(monkeypatch: pytest.MonkeyPatch):
@@ -28,7 +28,7 @@ def test_an_exception_of_a_reader_is_a_disagreement(monkeypatch: pytest.MonkeyPa
     python = read_in_python(b"")
     assert find_disagreement(python, Verdict(refused="the file is empty")).startswith("Python fails: ZeroDivisionError")
     javascript = Verdict(failed="node ended: exit code 1")
-    assert find_disagreement(Verdict(POSITIONS), javascript) == "JavaScript fails: node ended: exit code 1"
+    assert find_disagreement(Verdict(ONE_GROUP), javascript) == "JavaScript fails: node ended: exit code 1"
 
 
 @pytest.mark.skipif(not shutil.which("node"), reason="node is not installed")

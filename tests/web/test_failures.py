@@ -19,6 +19,12 @@ SCENE_FOLDER = Path(__file__).parents[1] / "golden" / "scene"
 HTML_DATA = b"\xef\xbb\xbf\n<!doctype html><title>Sorry</title>" * 20
 
 
+def open_cloud(browser: Browser, host: Site) -> None:
+    """Open a cloud in a player, and wait until its picture is complete."""
+    browser.open(f"{host.address}/index.html?content=cloud.spz")
+    browser.evaluate("hyrfpack.ready.then(() => hyrfpack.player.settled)")
+
+
 def is_visible(browser: Browser, name: str) -> bool:
     return browser.evaluate(f"document.getElementById('{name}').checkVisibility({{ visibilityProperty: true }})")
 
@@ -205,8 +211,7 @@ WORKER_FAILURES_JS = {
 
 @pytest.mark.parametrize("failure", WORKER_FAILURES_JS)
 def test_a_worker_that_fails_is_reported_and_nothing_waits_for_it(browser: Browser, host: Site, failure: str):
-    browser.open(f"{host.address}/index.html?content=cloud.spz")
-    browser.evaluate("hyrfpack.ready.then(() => hyrfpack.player.settled)")
+    open_cloud(browser, host)
     browser.evaluate(f"void (({{ player }}) => {{ {WORKER_FAILURES_JS[failure]}; }})(hyrfpack)")
     message = wait_for_message(browser)
     assert message.startswith("The player's worker has failed (") and message.endswith("); load the page again.")
@@ -220,8 +225,7 @@ def test_a_worker_that_fails_is_reported_and_nothing_waits_for_it(browser: Brows
 
 
 def test_an_order_that_a_failed_worker_owes_is_null(browser: Browser, host: Site):
-    browser.open(f"{host.address}/index.html?content=cloud.spz")
-    browser.evaluate("hyrfpack.ready.then(() => hyrfpack.player.settled)")
+    open_cloud(browser, host)
     expression = (
         "(({ loader, scene, ...player }, view) => { const order = loader.sort(view, scene),"
         " answer = loader.ask({ select: [] }).catch(({ message }) => message);"
@@ -233,8 +237,7 @@ def test_an_order_that_a_failed_worker_owes_is_null(browser: Browser, host: Site
 
 
 def test_replies_of_a_failed_worker_are_ignored(browser: Browser, host: Site):
-    browser.open(f"{host.address}/index.html?content=cloud.spz")
-    browser.evaluate("hyrfpack.ready.then(() => hyrfpack.player.settled)")
+    open_cloud(browser, host)
     expression = (
         "(({ loader, scene }, view) => { const { number, shared: { worker } } = loader.connection,"
         " sort = () => loader.sort(view, scene),"
@@ -273,8 +276,7 @@ def test_after_a_failure_of_the_worker_the_error_of_another_file_is_reported(bro
 
 
 def test_a_scene_whose_worker_fails_while_it_is_prepared_is_not_shown(browser: Browser, host: Site):
-    browser.open(f"{host.address}/index.html?content=cloud.spz")
-    browser.evaluate("hyrfpack.ready.then(() => hyrfpack.player.settled)")
+    open_cloud(browser, host)
     browser.evaluate("void (hyrfpack.player.renderer.prepare = () => new Promise((go) => (window.go = go)))")
     drop_file(browser, host.files["/some scene.hyrf"], "other.hyrf")
     wait_until(browser, "Boolean(window.go)")

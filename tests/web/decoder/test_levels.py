@@ -24,14 +24,16 @@ from tools.safety.make_golden import GOLDEN_PARTS_SCENE_FOLDER, GOLDEN_SCENE_FOL
 
 SELECT_SCRIPT = Path(__file__).with_name("select_levels.mjs")
 LATER_VERSION = json.dumps({**json.loads(VALID_MANIFEST.to_json()), "version": "1.7", "sky": "blue"}).encode()
-FRAME = {"center": [0, 0, 0], "scale": 1, "half_extent": [1, 1, 1]}
-ROTATED = with_value(["frame", "rotation"], [0.6, 0, -0.8, 0])
+VALID_FRAME = {"center": [0, 0, 0], "scale": 1, "half_extent": [1, 1, 1]}
+ROTATED_MANIFEST = with_value(["frame", "rotation"], [0.6, 0, -0.8, 0])
 INTEGRAL_FLOATS = VALID_MANIFEST.to_json().replace(b'"bytes":1000,', b'"bytes":1000.0,')
 NESTED_NAME = VALID_MANIFEST.to_json().replace(b'"shared.hyrf"', b"[" * 20_000 + b"]" * 20_000)
-VIEWPOINTS = {depth: json.loads("[" * depth + "]" * depth) for depth in (62, 63)}  # below the manifest and 'viewpoint'
+VIEWPOINT_BY_DEPTH = {
+    depth: json.loads("[" * depth + "]" * depth) for depth in (62, 63)
+}  # below the manifest and 'viewpoint'
 BAD_MANIFESTS = [
     NESTED_NAME,
-    with_value(["viewpoint"], {"a": VIEWPOINTS[63]}),
+    with_value(["viewpoint"], {"a": VIEWPOINT_BY_DEPTH[63]}),
     b"",
     b"[]",
     b"{}",
@@ -129,7 +131,7 @@ def random_manifest(rng: np.random.Generator) -> Manifest:
         chunks.append(Chunk(tuple(low), tuple(low + rng.uniform(0, 10, 3)), tuple(levels)))
     count = sum(chunk.levels[0].gaussians for chunk in chunks)
     return Manifest(
-        count, (ScenePart("shared.hyrf", 500, "0123abcd"),), tuple(chunks), radii, FRAME, False, (0.0, 0.0, 0.0)
+        count, (ScenePart("shared.hyrf", 500, "0123abcd"),), tuple(chunks), radii, VALID_FRAME, False, (0.0, 0.0, 0.0)
     )
 
 
@@ -180,7 +182,7 @@ def test_levels_that_are_not_available_are_left_out(tmp_path: Path):
         for chunk in chunks
     )
     count = sum(chunk.levels[0].gaussians for chunk in chunks)
-    manifest = Manifest(count, files, chunks, (50.0,), FRAME, False, (0.0, 0.0, 0.0))
+    manifest = Manifest(count, files, chunks, (50.0,), VALID_FRAME, False, (0.0, 0.0, 0.0))
     missing = [[0, 0], *([1, level] for level in range(len(chunks[1].levels)))]
     limit = count // 3
 
@@ -218,8 +220,8 @@ def test_manifests_are_accepted_and_refused_as_in_python(tmp_path: Path):
         PARTS_MANIFEST.to_json(),
         LATER_VERSION,
         INTEGRAL_FLOATS,
-        ROTATED,
-        with_value(["viewpoint"], {"a": VIEWPOINTS[62]}),
+        ROTATED_MANIFEST,
+        with_value(["viewpoint"], {"a": VIEWPOINT_BY_DEPTH[62]}),
         *titles,
         *golden,
     ]
