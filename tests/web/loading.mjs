@@ -3,8 +3,9 @@
 // Prints, as JSON, `loaderError`: the class of the error of a scene folder's loader that is disposed of before its
 // manifest has arrived; `folderName`: the name that another one gives a scene in a folder whose name is no valid
 // address; `cancelled`: whether a file that is not read is no longer downloaded, and whether the whole file is not,
-// which a server sends in place of the rest of a broken download; and `lifted`: what the controls of an embedded scene
-// report when a pointer is released that was pressed elsewhere.
+// which a server sends in place of the rest of a broken download; `lifted`: what the controls of an embedded scene
+// report when a pointer is released that was pressed elsewhere; and `changes`: how many changes controls report when a
+// key that flies is pressed on their canvas, which lies in a dialog, and in a field of that dialog.
 
 globalThis.window = globalThis.self = globalThis;
 globalThis.document = { baseURI: "http://host/" };
@@ -69,6 +70,16 @@ const ignored = (kind) => lifted.push(kind);
 new Controls({ canvas }, null, { keyTarget: new EventTarget(), isEmbedded: true, acted: () => {}, ignored });
 canvas.dispatchEvent(Object.assign(new Event("pointerup"), { pointerId: 1, clientX: 5, clientY: 5 }));
 
+let changes = 0;
+const move = () => {}, inDialog = () => ({}), flown = { canvas, eye: { pace: 1, move }, changed: () => changes++ };
+const press = (target) => {
+  target.closest = inDialog;
+  new Controls(flown, null, { keyTarget: target, isEmbedded: false, acted: () => {} });
+  target.dispatchEvent(Object.assign(new Event("keydown"), { key: "w", code: "KeyW" }));
+  return changes;
+};
+const changesOf = [press(canvas), press(new EventTarget())];
+
 const loaderError = error.constructor.name;
-console.log(JSON.stringify({ loaderError, folderName, cancelled: cancelled.slice(0, 2), lifted }));
+console.log(JSON.stringify({ loaderError, folderName, cancelled: cancelled.slice(0, 2), lifted, changes: changesOf }));
 process.exit();

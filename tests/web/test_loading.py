@@ -36,6 +36,10 @@ def test_a_pointer_that_was_pressed_elsewhere_shows_no_hint(loading: dict):
     assert loading["lifted"] == []
 
 
+def test_a_key_that_flies_reports_a_change_also_on_a_canvas_in_a_dialog(loading: dict):
+    assert loading["changes"] == [1, 1]  # no change is added by a key in a field of the dialog
+
+
 def test_a_closed_stream_requests_nothing_more(closed_stream: dict):
     assert closed_stream["late"] == 0
 

@@ -33,8 +33,9 @@ def test_the_first_layer_is_shown_while_the_rest_is_loading(browser: Browser, tm
     run_statements(
         browser,
         f"window.file = Uint8Array.from(atob('{file}'), (c) => c.charCodeAt(0));"
-        "window.counts = []; window.sendRest = null; const { player } = hyrfpack;"
-        "player.addEventListener('loaded', () => { counts.push(player.renderer.content.count);"
+        "window.counts = []; window.parts = []; window.sendRest = null; const { player } = hyrfpack;"
+        "player.addEventListener('progress', ({ detail }) => (window.part = detail.part));"
+        "player.addEventListener('loaded', () => { counts.push(player.renderer.content.count); parts.push(part);"
         " sendRest?.(); sendRest = null; });"
         "player.addEventListener('count', ({ detail }) => (window.counted = detail.count));",
     )
@@ -45,6 +46,8 @@ def test_the_first_layer_is_shown_while_the_rest_is_loading(browser: Browser, tm
     )
     first, last = browser.evaluate("counts")
     assert 0 < first < last == 14000
+    first, last = browser.evaluate("parts")
+    assert first < last == 1
     wait_until_complete(browser)
     assert browser.evaluate("hyrfpack.player.whole") and browser.evaluate("counted") == 14000
 
@@ -57,7 +60,7 @@ def test_a_damaged_file_is_refused_with_one_sentence(browser: Browser, tmp_path:
     file.write_bytes(make_model_page(random_model(50), bytes(data)))
     browser.open(file.as_uri())
     message = browser.evaluate("hyrfpack.ready.then(() => '', (error) => error.message)")
-    assert "cannot be unpacked" in message and "\n" not in message
+    assert "cannot be shown" in message and "\n" not in message
 
 
 def test_a_file_with_an_invalid_header_is_refused_before_the_rest_arrives(one_browser: Browser, tmp_path: Path):

@@ -185,7 +185,7 @@ def test_missing_webgl_damaged_pages_and_invalid_cameras_are_reported(browser: B
         assert "needs WebGL 2" in wait_for_message(browser)
     file.write_bytes(re.sub(rb'(class="payload">.{400}).{40}', rb"\1", page))
     browser.open(file.as_uri())
-    assert "cannot be unpacked" in wait_for_message(browser)
+    assert "cannot be shown" in wait_for_message(browser)
     file.write_bytes(page)
     browser.open(file.as_uri() + "#camera={}")
     assert "needs width" in wait_for_message(browser)

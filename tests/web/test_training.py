@@ -141,7 +141,7 @@ def test_the_last_snapshot_stays_and_the_page_reports_the_end_of_training(browse
     with open_training_page(browser, (encode_snapshot(20), 3000)) as (_, end):
         wait_until(browser, f"{LOADED_COUNT_JS} === 20")
         end()
-        wait_until(browser, f"{REMARK_TEXT_JS}.startsWith('The training does not answer any more')", seconds=30)
+        wait_until(browser, f"{REMARK_TEXT_JS}.startsWith('The training no longer answers')", seconds=30)
         assert browser.evaluate(LOADED_COUNT_JS) == 20
         browser.drag((120, 90), (170, 100))
         wait_until_still(browser)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+import time
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ REPOSITORY_ROOT = Path(__file__).parents[2]
 GOLDEN_FILE = REPOSITORY_ROOT / "tests" / "golden" / "v1.1_compact.hyrf"
 CREATE_JS = "window.viewer = createViewer({ container: '#box', src: 'some scene.hyrf' });"
 READY_JS = "viewer.isReady"
+PAUSE_SECONDS = 5
 
 
 @pytest.fixture
@@ -228,6 +230,34 @@ def test_a_scene_of_which_a_part_is_shown_becomes_ready_when_the_next_one_is_mis
     assert "404" in error_of(browser, "viewer.load('gone.hyrf')")
     browser.evaluate("end(), second")
     assert browser.evaluate("[viewer.isReady, window.fired]") == [True, 1]
+
+
+def test_the_time_of_a_pause_is_not_that_of_a_frame(browser: Browser, site: Site):
+    open_viewer(browser, site)
+    wait_until(browser, READY_JS)
+    browser.evaluate(
+        "((player) => { window.times = []; player.measure = (took) => times.push(took);"
+        " window.turn = () => { player.eye.orbit(0.1, 0); player.changed(); }; turn(); })(viewer.player)"
+    )
+    wait_until(browser, "viewer.player.began !== null")
+    browser.evaluate("viewer.player.pause(), 0")
+    time.sleep(PAUSE_SECONDS)
+    browser.evaluate("viewer.player.resume(), turn(), 0")
+    wait_until(browser, "(viewer.player.began === null && turn(), times.length > 0)")
+    assert max(browser.evaluate("times")) < 1000 * PAUSE_SECONDS
+
+
+def test_frames_wait_for_their_own_order_after_a_preview(browser: Browser, site: Site):
+    open_viewer(browser, site)
+    wait_until(browser, READY_JS)
+    browser.evaluate("viewer.player.settled.then(() => true)")
+    browser.evaluate(
+        "((renderer, { read } = renderer) => { window.sorted = []; renderer.read = (...all) => {"
+        " queueMicrotask(() => sorted.push(renderer.isSorted)); return read.apply(renderer, all); }; })"
+        "(viewer.player.renderer)"
+    )
+    size = browser.evaluate("viewer.player.preview([viewer.player.view()]).then((pictures) => pictures?.length ?? 0)")
+    assert size == 1 and browser.evaluate("sorted") == [False]
 
 
 def test_a_screenshot_is_completed_out_of_the_window(browser: Browser, site: Site):

@@ -15,29 +15,27 @@ export class RowStates {
    * @param {number[]} sides from `frustumPlanes`
    * @param {number[]} eye
    * @param {number} angle in radians
-   * @returns {{visible: number, fresh: number, rows: number[]}} `visible` is the number of rows within the planes
+   * @returns {{visible: number, rows: number[]}} `visible` is the number of rows within the planes
    *   `sides`. `rows` are those among them whose viewing direction has turned by more than `angle` since they were
-   *   coloured, largest turns first. `fresh` is the number of these that have no colours yet.
+   *   coloured, largest turns first; rows that have no colours yet come first of all.
    */
   stale(sides, eye, angle) {
     const { balls, eyes } = this, angles = new Float64Array(this.count);
     /** @type {number[]} */
     const stale = [];
-    let visible = 0, fresh = 0;
+    let visible = 0;
     for (let row = 0, b = 0, e = 0; row < this.count; row++, b += 4, e += 3) {
       const [x, y, z, radius] = balls.subarray(b, b + 4);
       if (!intersectsFrustum(sides, x, y, z, radius)) continue;
       visible++;
       const moved = Math.hypot(eye[0] - eyes[e], eye[1] - eyes[e + 1], eye[2] - eyes[e + 2]);
       if (moved === 0) continue;
-      const never = Number.isNaN(moved);
-      angles[row] = never ? Infinity : moved / Math.max(Math.hypot(eye[0] - x, eye[1] - y, eye[2] - z), radius);
-      if (angles[row] <= angle) continue;
-      stale.push(row);
-      if (never) fresh++;
+      const distance = Math.max(Math.hypot(eye[0] - x, eye[1] - y, eye[2] - z), radius);
+      angles[row] = Number.isNaN(moved) ? Infinity : moved / distance;
+      if (angles[row] > angle) stale.push(row);
     }
     stale.sort((a, b) => Number(angles[b] > angles[a]) - Number(angles[b] < angles[a]));
-    return { visible, fresh, rows: stale };
+    return { visible, rows: stale };
   }
 
   /**

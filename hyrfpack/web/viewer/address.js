@@ -103,7 +103,7 @@ export function formatCamera(eye, scene) {
 function parseCompactCamera(text, scene) {
   const numbers = text.split(",").map((part) => (part.trim() ? Number(part) : NaN));
   if (![8, 9].includes(numbers.length) || !numbers.every(Number.isFinite)) {
-    throw new Error("it is a camera's number, JSON, or 9 numbers as the share link writes them");
+    throw new Error("it must be a camera's number, JSON, or 9 numbers as in share links");
   }
   const position = numbers.slice(0, 3), quat = numbers.slice(3, 7), [focal, depth = 0] = numbers.slice(7);
   if (!(Math.hypot(...quat) > 0.5)) throw new Error("its rotation is no unit quaternion");

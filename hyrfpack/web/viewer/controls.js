@@ -175,12 +175,16 @@ export class Controls {
     const key = keyName(event), moves = FLY_AXES[key] || LOOK_SIGNS[key] || ZOOM_SIGNS[key];
     const inputs = LOOK_SIGNS[key] ? "input" : "input:not([type='range'], [type='checkbox'])";
     const users = key === "Escape" ? "dialog" : `dialog, select, textarea, ${inputs}`; // elements that use the key
-    if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest?.(users)) return;
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.target !== this.canvas && event.target.closest?.(users)) return; // the canvas may lie in a dialog
     if (moves || key === "Shift") {
       this.held.set(event.code, key);
       if (LOOK_SIGNS[key]) event.preventDefault();
-      if (moves) this.acted();
-      if (moves && this.eye && !event.repeat) this.step(key, KEY_PRESS_SECONDS, event.shiftKey);
+      if (!moves) return;
+      this.acted();
+      if (!this.eye || event.repeat) return;
+      this.step(key, KEY_PRESS_SECONDS, event.shiftKey);
+      this.player.changed();
     } else if (!event.repeat) {
       this.press(key);
     }

@@ -95,7 +95,7 @@ export class Player extends EventTarget {
     const { signal } = this.aborter;
     canvas.addEventListener("webglcontextlost", (event) => this.onLost(event), { signal });
     canvas.addEventListener("webglcontextrestored", () => this.onRestored(), { signal });
-    addEventListener("resize", () => this.schedule(), { signal }); // fired for a new pixel ratio, too
+    for (const event of ["resize", "visibilitychange"]) addEventListener(event, () => this.wake(), { signal });
     this.observer = new ResizeObserver(() => this.schedule());
     this.observer.observe(canvas);
   }
@@ -132,7 +132,7 @@ export class Player extends EventTarget {
     } catch (error) {
       if (error instanceof SupersededError) return;
       if (error instanceof StartError) throw error;
-      throw new Error(`The scene cannot be unpacked; if this page is truncated, fetch it again (${error.message}).`);
+      throw new Error(`The scene cannot be shown; if this page is truncated, fetch it again (${error.message}).`);
     }
   }
 
@@ -245,7 +245,7 @@ export class Player extends EventTarget {
         const end = this.loaded ? Infinity : performance.now() + FIRST_PICTURE_MS;
         await content.coloured(view, scene.tolerance, {
           goOn: () => this.wanted(loader) && performance.now() < end,
-          report: (part) => this.progress(loader, "preparing", part),
+          report: (part) => message.whole && this.progress(loader, "preparing", part),
         });
       }
       staged = this.renderer.stage(content, scene, picture ?? loader.picture);
@@ -324,7 +324,7 @@ export class Player extends EventTarget {
     else if (!initial && scene.count !== loader.scene.count) this.emit("count", scene);
     loader.scene = scene;
     this.emit("remark", loader.remark);
-    this.progress(loader, "preparing", 1);
+    if (this.whole) this.progress(loader, "preparing", 1);
     if (!keepsEye) this.emit("loaded");
     this.resize();
     this.sort();
@@ -477,7 +477,13 @@ export class Player extends EventTarget {
 
   resume() {
     this.paused = false;
-    this.before = null; // the time of the pause moves nothing
+    this.wake();
+  }
+
+  // Requests an animation frame. The time since the last one moves nothing, and does not count as that of a slow frame:
+  // paused and hidden pages get none.
+  wake() {
+    this.before = this.began = null;
     this.schedule();
   }
 
@@ -698,7 +704,9 @@ export class Player extends EventTarget {
       if (!sorted || !isWanted()) return;
       this.unsorted = true;
       this.setOrder(sorted);
-      pictures.push(await this.renderer.read(view, this.exposureOf(view)));
+      const picture = this.renderer.read(view, this.exposureOf(view));
+      this.renderer.isSorted = false; // frames of the window wait for their own order
+      pictures.push(await picture);
     };
     for (const view of views) await this.enqueue(() => draw(view));
     this.sort(); // for the window's view

@@ -2,8 +2,8 @@
 
 import { toast } from "./notifications.js";
 
-const NOT_INCLUDED_TEXT = "There is no link to share: it would not include the opened file. Send the file instead.";
-const NOT_ON_WEB_TEXT = "There is no link to share: this page is not on the web. Send its file instead.";
+const NOT_INCLUDED_TEXT = "A link would not include the opened file; send the file instead.";
+const NOT_ON_WEB_TEXT = "This page is not on the web; send its file instead.";
 const LOCAL_HOSTS = ["localhost", "127.0.0.1", "[::1]"];
 
 // Puts this camera and exposure (null for the default) into the page's address. Then shares the address where touch

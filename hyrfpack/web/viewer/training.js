@@ -4,7 +4,7 @@ import { remark } from "./notifications.js";
 import { fetchedFile } from "./source.js";
 
 const NOT_STARTED_TEXT = "The training has not taken its first step yet.";
-const TRAINING_ENDED_TEXT = "The training does not answer any more; this is the last snapshot that the page received.";
+const TRAINING_ENDED_TEXT = "The training no longer answers; this is its last snapshot.";
 const NEVER_STARTED_TEXT = "The training ended before its first step; see its terminal.";
 
 const REQUEST_INTERVAL_MS = 2000;

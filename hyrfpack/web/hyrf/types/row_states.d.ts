@@ -9,13 +9,12 @@ export declare class RowStates {
      * @param {number[]} sides from `frustumPlanes`
      * @param {number[]} eye
      * @param {number} angle in radians
-     * @returns {{visible: number, fresh: number, rows: number[]}} `visible` is the number of rows within the planes
+     * @returns {{visible: number, rows: number[]}} `visible` is the number of rows within the planes
      *   `sides`. `rows` are those among them whose viewing direction has turned by more than `angle` since they were
-     *   coloured, largest turns first. `fresh` is the number of these that have no colours yet.
+     *   coloured, largest turns first; rows that have no colours yet come first of all.
      */
     stale(sides: number[], eye: number[], angle: number): {
         visible: number;
-        fresh: number;
         rows: number[];
     };
     /**
