@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hyrfpack.cameras.view_sampling import resize_camera
 from hyrfpack.format.scene_model import join_parts
-from hyrfpack.lod.select import project_sphere
+from hyrfpack.lod.select import MIN_LEFT_OUT_MSE, project_sphere
 from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.model.merged import MergedModel
 from hyrfpack.ops.rasterize import rasterize
@@ -28,6 +28,8 @@ ERROR_RADII = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0)
 RESOLUTION_SHARES = ((1.0, 1 / 4), (1 / 2, 1 / 8))
 # A pixel of which a half of the chunks has a smaller share counts less, because its error comes from elsewhere.
 MIN_SHARE = 1e-3
+# Errors of a chunk whose light in all views, at a radius, adds up to less than this are errors of its neighbours.
+MIN_LIGHT_PIXELS = 1.0
 _COLUMNS = 3  # shares of chunks that are drawn at once, as the three channels of a picture
 
 
@@ -45,7 +47,8 @@ def measure_level_errors(
 
     In each view a random half of the chunks is drawn at a level, and the other half at the finest one; then the halves
     change places. So chunks are measured among neighbours of other levels, as views with a budget mix them. The squared
-    error of a pixel is divided among the chunks of the half by their light in the render of the finest levels.
+    error of a pixel is divided among the chunks of the half by their light in the render of the finest levels. A chunk
+    that no view shows has the errors of all measured chunks together.
 
     Args:
         levels: models of all chunks at each level, the finest first. Those of a part share their fields.
@@ -63,7 +66,7 @@ def measure_level_errors(
     """
     pool = _Pool.of(levels, fields or levels[0][:1], parts or [0] * len(spheres))
     shape, rng = (len(levels), len(spheres), len(ERROR_RADII)), np.random.default_rng(seed)
-    sums, areas = np.zeros(shape), np.zeros(shape[1:])
+    sums, areas, lights = np.zeros(shape), np.zeros(shape[1:]), np.zeros(shape[1:])
     turns = zip(cameras, itertools.cycle(RESOLUTION_SHARES))
     views = [resize_camera(camera, share) for camera, shares in turns for share in shares]
     for number, camera in enumerate(views):
@@ -84,9 +87,12 @@ def measure_level_errors(
                 radius, area = projections[chunk]
                 weights = _node_weights(radius)
                 areas[chunk] += weights * area
+                lights[chunk] += weights * float(shares[..., column].sum())
                 for level, error in enumerate(errors[0 if in_half[chunk] else 1], 1):
                     sums[level, chunk] += weights * float((error * shares[..., column]).sum())
-    return _fill_gaps(sums, areas)
+    # The sphere of a chunk may cover a picture that shows no Gaussian of it, such as one beside or behind the camera.
+    is_shown = lights >= MIN_LIGHT_PIXELS
+    return _fill_gaps(sums * is_shown, areas * is_shown)
 
 
 @dataclass(frozen=True)
@@ -145,11 +151,22 @@ def _node_weights(radius: float) -> np.ndarray:
 
 
 def _fill_gaps(sums: np.ndarray, areas: np.ndarray) -> np.ndarray:
-    """Divide sums by areas; radii that no view shows take the error of the nearest one that a view does."""
-    errors = np.zeros_like(sums)
-    for chunk, area in enumerate(areas):
-        measured = np.flatnonzero(area > 0)
-        if len(measured):
-            nearest = measured[np.abs(np.arange(len(area))[:, None] - measured).argmin(axis=1)]
-            errors[:, chunk] = sums[:, chunk, nearest] / area[nearest]
-    return errors
+    """Divide sums (levels, chunks, K) of errors by areas (chunks, K), and estimate what no view shows.
+
+    Radii that no view shows take the error of the nearest one that a view does. Chunks that no view shows take the
+    errors of all measured chunks together, raised so that none falls towards coarser levels. If no view shows any
+    chunk, coarse levels have the error MIN_LEFT_OUT_MSE.
+    """
+    typical = np.full((sums.shape[0], sums.shape[2]), MIN_LEFT_OUT_MSE)
+    typical[0] = 0.0
+    if areas.any():
+        typical = np.maximum.accumulate(_mean_errors(sums.sum(axis=1), areas.sum(axis=0)), axis=0)
+    chunks = [_mean_errors(sums[:, chunk], area) if area.any() else typical for chunk, area in enumerate(areas)]
+    return np.stack(chunks, axis=1)
+
+
+def _mean_errors(sums: np.ndarray, areas: np.ndarray) -> np.ndarray:
+    """Divide sums (levels, K) by areas (K,), of which one is positive; K without an area take those of the nearest."""
+    measured = np.flatnonzero(areas > 0)
+    nearest = measured[np.abs(np.arange(len(areas))[:, None] - measured).argmin(axis=1)]
+    return sums[:, nearest] / areas[nearest]
