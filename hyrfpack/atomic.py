@@ -8,6 +8,7 @@ import itertools
 import os
 import re
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -96,7 +97,7 @@ def pending_file(
             failed write.
     """
     path = Path(path)
-    try:
+    with naming_failed_write(path, length):
         make_folder(Path(os.path.realpath(path)).parent)
         if overwrite and os.path.exists(path) and not os.path.isfile(path):
             if os.path.isdir(path):
@@ -113,8 +114,35 @@ def pending_file(
             else:
                 pending.path = path.with_name(_move_to_free_name(temporary, target, rename).name)
         _sync_folder(target.parent)
+
+
+@contextmanager
+def naming_failed_write(path: str | os.PathLike[str], length: int | None = None) -> Iterator[None]:
+    """Turn an OSError in the block into a HyrfError that says that `path`, of `length` bytes, was not written."""
+    try:
+        yield
     except OSError as error:
         raise _write_error(path, length, error) from error
+
+
+@contextmanager
+def temporary_folder(parent: Path) -> Iterator[Path]:
+    """Yield a new, empty folder in an existing one, and remove it with all that it holds at the end.
+
+    Like temporary files, the folders of killed processes are removed by the next call that writes into `parent` (but
+    not on Windows).
+
+    Raises:
+        OSError: the folder cannot be created.
+    """
+    _remove_stale_files(parent)
+    folder, lock = _create_locked_folder(parent)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
 
 
 def numbered_names(path: Path) -> Iterator[Path]:
@@ -229,21 +257,45 @@ def _temporary_file(folder: Path) -> Iterator[Path]:
 def _create_locked_file(folder: Path) -> tuple[Path, int | None]:
     """Create a temporary file and return it with the descriptor of its lock, which shows others that it is in use."""
     while True:
-        temporary = folder / f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}{TEMPORARY_SUFFIX}"
+        temporary = folder / _temporary_name()
         # The module tempfile would make the file private (mode 0600).
-        lock = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         if fcntl is None:  # Windows cannot rename an open file
-            os.close(lock)
+            os.close(descriptor)
             return temporary, None
-        with contextlib.suppress(OSError):  # Some network folders have no locks. Stale files stay there.
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        if temporary.exists():
-            return temporary, lock
-        os.close(lock)  # Another process removed the file as a stale one before it was locked.
+        if _lock_temporary(temporary, descriptor):
+            return temporary, descriptor
+
+
+def _create_locked_folder(parent: Path) -> tuple[Path, int | None]:
+    """Create a temporary folder and return it with the descriptor of its lock, as `_create_locked_file` does."""
+    while True:
+        temporary = parent / _temporary_name()
+        os.mkdir(temporary)
+        if fcntl is None:  # Windows cannot open a folder
+            return temporary, None
+        with contextlib.suppress(FileNotFoundError):
+            descriptor = os.open(temporary, os.O_RDONLY)
+            if _lock_temporary(temporary, descriptor):
+                return temporary, descriptor
+
+
+def _temporary_name() -> str:
+    return f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}{TEMPORARY_SUFFIX}"
+
+
+def _lock_temporary(temporary: Path, descriptor: int) -> bool:
+    """Lock an open file or folder; return False if another process has removed it as a stale one before."""
+    with contextlib.suppress(OSError):  # Some network folders have no locks. Stale files stay there.
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+    if temporary.exists():
+        return True
+    os.close(descriptor)
+    return False
 
 
 def _remove_stale_files(folder: Path) -> None:
-    """Remove the temporary files of killed processes, which are those whose lock is free."""
+    """Remove the temporary files and folders of killed processes, which are those whose lock is free."""
     if fcntl is None:
         return
     try:
@@ -253,10 +305,14 @@ def _remove_stale_files(folder: Path) -> None:
     for name in names:
         if name.startswith(TEMPORARY_PREFIX) and name.endswith(TEMPORARY_SUFFIX):
             with contextlib.suppress(OSError):
-                lock = os.open(folder / name, os.O_RDWR)
+                is_folder = os.path.isdir(folder / name)
+                lock = os.open(folder / name, os.O_RDONLY if is_folder else os.O_RDWR)
                 try:
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    os.unlink(folder / name)
+                    if is_folder:
+                        shutil.rmtree(folder / name)
+                    else:
+                        os.unlink(folder / name)
                 finally:
                     os.close(lock)
 

@@ -104,7 +104,7 @@ def export_player(
             suggest_compression(source)
         with ExitStack() as joined:
             file = None if source is None else joined.enter_context(single_file(source))
-            output = joined.enter_context(IndexedFolder(Path(folder), overwrite))
+            output = joined.enter_context(IndexedFolder(Path(folder), INDEX_NAME, overwrite))
             return _write_player(file, output, data, title, credit, editable)
 
 
@@ -205,7 +205,7 @@ def export_gallery(
             for source in sources:
                 suggest_compression(source)
             files = [joined.enter_context(single_file(source)) for source in sources]
-            output = joined.enter_context(IndexedFolder(Path(folder), overwrite))
+            output = joined.enter_context(IndexedFolder(Path(folder), INDEX_NAME, overwrite))
             return _write_gallery(sources, files, output, scenes, title, credit, editable)
 
 

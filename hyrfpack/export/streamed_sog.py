@@ -25,7 +25,7 @@ from hyrfpack.export.kinds import STREAMED_SOG_FOLDER
 from hyrfpack.export.levels import BakedLevels
 from hyrfpack.format.metadata import writer_name
 from hyrfpack.format.scene_manifest import Chunk
-from hyrfpack.outputs.indexed_folder import IndexedFolder, writing_indexed_folder
+from hyrfpack.outputs.indexed_folder import IndexedFolder
 from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.splats import Splats, concatenate
@@ -72,7 +72,7 @@ def write_streamed_sog(
     files = [(level, group) for level in range(level_count) for group in _group_chunks(baked, order, level)]
     leaves = [_Leaf() for _ in baked.chunks]
     names, shown, counts = [], [], [0] * level_count
-    with writing_indexed_folder(target, INDEX_NAME, overwrite) as folder:
+    with IndexedFolder(target, INDEX_NAME, overwrite) as folder:
         for number, (level, group) in enumerate(files):
             progress(TaskEvent(f"writing file {number + 1}/{len(files)}", number / len(files)))
             name = f"{level}_{sum(1 for other, _ in files[:number] if other == level)}"

@@ -37,7 +37,7 @@ from hyrfpack.export.kinds import SPZ_TILES_FOLDER, TILES_FOLDER
 from hyrfpack.export.levels import BakedChunk, BakedLevels
 from hyrfpack.format.metadata import writer_name
 from hyrfpack.format.scene_manifest import Chunk, Manifest
-from hyrfpack.outputs.indexed_folder import IndexedFolder, writing_indexed_folder
+from hyrfpack.outputs.indexed_folder import IndexedFolder
 from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.splats.formats import gltf
 from hyrfpack.splats.placement import local_origin, upright_rotation
@@ -78,7 +78,7 @@ def write_tiles(
     compressed = kind is SPZ_TILES_FOLDER
     loaded, manifest = baked.finest.source, baked.scene.manifest
     origin = local_origin(baked.finest.splats.positions)
-    with writing_indexed_folder(target, INDEX_NAME, overwrite) as folder:
+    with IndexedFolder(target, INDEX_NAME, overwrite) as folder:
         contents = _ContentWriter(folder, origin, compressed)
         chunks, shown = [], []
         for place, chunk in enumerate(baked.chunks):

@@ -48,7 +48,7 @@ from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.merged import MergedModel, parts_of
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.outputs import Outputs, StrPath
-from hyrfpack.outputs.indexed_folder import writing_indexed_folder
+from hyrfpack.outputs.indexed_folder import IndexedFolder
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 
@@ -371,9 +371,9 @@ def _check_manifest(manifest: Manifest, path: Path) -> None:
 
 
 def _write_folder(folder: Path, files: dict[str, bytes], manifest: Manifest, overwrite: bool) -> None:
-    """Write all files and then the manifest; if anything fails, the folder holds no manifest and no new file."""
+    """Replace the files of a folder, the manifest last; files of an old scene that the new one lacks are removed."""
     old = _list_old_files(folder) if overwrite else []
-    with writing_indexed_folder(folder, MANIFEST_NAME, overwrite) as output:
+    with IndexedFolder(folder, MANIFEST_NAME, overwrite) as output:
         for name, data in files.items():
             output.write(name, data)
         output.write(MANIFEST_NAME, manifest.to_json())

@@ -1,83 +1,103 @@
-"""Folders of files that an index names: the index is written last, so that it never names a missing file."""
+"""Folders of files that an index names: all of them are replaced together, and the index is the last."""
 
 from __future__ import annotations
 
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from hyrfpack.atomic import pending_file, write_atomic
+from hyrfpack.atomic import make_folder, naming_failed_write, pending_file, temporary_folder
 
 
 class IndexedFolder:
-    """A folder whose files are being written. Files with other names stay.
+    """A folder whose files are being written, of which the caller writes the index last. Files with other names stay.
 
-    Files refer to each other by name, so a name that is taken causes an error instead of another name. As a context, it
-    removes the files that did not exist before if anything fails, so that the same call can be repeated.
+    As a context, it keeps new files in a temporary folder and moves them to their places at the end, in the order in
+    which they were written. If anything fails before, the folder is as it was. An old index is removed only when all
+    files are written, just before the first is moved, so that it cannot name a mixture of old and new files. If a move
+    fails, the files that did not exist before are removed, so that the same call can be repeated.
+
+    Files refer to each other by name, so a name that is taken causes an error instead of another name.
+
+    Attributes:
+        path: the folder.
+        bytes: bytes of the files so far.
     """
 
-    def __init__(self, path: Path, overwrite: bool) -> None:
-        self.path, self.overwrite, self.bytes = path, overwrite, 0
-        self._new: list[Path] = []
+    def __init__(self, path: Path, index_name: str, overwrite: bool) -> None:
+        """Describe the folder.
+
+        Args:
+            path: the folder; created if it is missing.
+            index_name: name of the index.
+            overwrite: replace existing files; if False, an existing file is an error.
+        """
+        self.path, self.index_name, self.overwrite, self.bytes = path, index_name, overwrite, 0
+        self._resources = ExitStack()
+        self._names: list[str] = []
 
     def __enter__(self) -> IndexedFolder:
+        make_folder(self.path)
+        with naming_failed_write(self.path / self.index_name):
+            self._temporary = self._resources.enter_context(temporary_folder(self.path))
         return self
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        if error is not None:
-            self._remove_new_files()
+        with self._resources:
+            if error is None:
+                self._move_files()
 
     def write(self, name: str, data: bytes) -> None:
         """Write a file, whose name may contain folders.
 
         Raises:
-            HyrfError: the file cannot be written, or it exists and may not be replaced.
+            HyrfError: the file cannot be written.
         """
-        with self._recorded(name) as path:
-            write_atomic(path, data, overwrite=self.overwrite, rename=False)
+        with self._added(name, len(data)) as path:
+            path.write_bytes(data)
 
     def copy(self, name: str, source: str | os.PathLike[str]) -> None:
         """Copy a file; name and errors are those of `write`."""
-        with (
-            self._recorded(name) as path,
-            pending_file(path, os.path.getsize(source), overwrite=self.overwrite, rename=False) as pending,
-        ):
-            shutil.copyfile(source, pending.temporary)
+        with self._added(name, os.path.getsize(source)) as path:
+            shutil.copyfile(source, path)
 
     @contextmanager
-    def _recorded(self, name: str) -> Iterator[Path]:
-        """Yield the path of a file that the block writes, and count the file."""
-        path = self.path / name
-        is_new = not path.exists()
-        yield path
-        self._new += [path] * is_new
+    def _added(self, name: str, length: int) -> Iterator[Path]:
+        """Yield the temporary path of a file that the block writes, and count the file."""
+        path = self._temporary / name
+        with naming_failed_write(self.path / name, length):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield path
+            with open(path, "rb+") as file:  # a full disk may be noticed only here, while the old files are there
+                os.fsync(file.fileno())
+        self._names.append(name)
         self.bytes += path.stat().st_size
 
-    def _remove_new_files(self) -> None:
-        """Remove the files that did not exist before, and folders that are empty then."""
-        for path in self._new:
-            with suppress(OSError):
-                path.unlink()
-        for folder in {path.parent for path in self._new} - {self.path}:
-            with suppress(OSError):  # it holds other files
-                folder.rmdir()
+    def _move_files(self) -> None:
+        """Move all files to their places.
 
-
-@contextmanager
-def writing_indexed_folder(path: Path, index_name: str, overwrite: bool) -> Iterator[IndexedFolder]:
-    """Yield an `IndexedFolder` to write files into, of which the caller writes the index last.
-
-    An old index is removed first, so that it cannot name a mixture of old and new files.
-
-    Args:
-        path: the folder.
-        index_name: name of the index.
-        overwrite: replace existing files; if False, an existing file is an error.
-    """
-    if overwrite:
-        with suppress(FileNotFoundError):
-            (path / index_name).unlink()
-    with IndexedFolder(path, overwrite) as folder:
-        yield folder
+        Raises:
+            HyrfError: a file cannot be moved, or it exists and may not be replaced.
+        """
+        new, folders = [], {(self.path / name).parent for name in self._names} - {self.path}
+        if self.overwrite:
+            with naming_failed_write(self.path / self.index_name), suppress(FileNotFoundError):
+                os.unlink(os.path.realpath(self.path / self.index_name))
+        try:
+            for name in self._names:
+                path, source = self.path / name, self._temporary / name
+                is_new = not path.exists()
+                length = source.stat().st_size
+                with pending_file(path, length, overwrite=self.overwrite, rename=False) as pending:
+                    shutil.move(source, pending.temporary)
+                new += [path] * is_new
+        except BaseException:
+            for path in new:
+                with suppress(OSError):
+                    path.unlink()
+            for folder in folders:
+                with suppress(OSError):  # it holds other files, or was not created
+                    folder.rmdir()
+            raise

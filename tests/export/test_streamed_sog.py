@@ -262,7 +262,7 @@ def test_a_folder_that_another_call_writes_is_refused(scene, tmp_path):
         export(scene, tmp_path / "out")
 
 
-def test_a_failed_export_leaves_no_index_and_no_new_file(scene, tmp_path, monkeypatch):
+def test_a_failed_export_leaves_the_old_index_and_no_new_file(scene, tmp_path, monkeypatch):
     encode, calls = sog.encode_files, []
 
     def fail_at_the_second_file(*arguments):
@@ -277,4 +277,5 @@ def test_a_failed_export_leaves_no_index_and_no_new_file(scene, tmp_path, monkey
     monkeypatch.setattr(sog, "encode_files", fail_at_the_second_file)
     with pytest.raises(HyrfError, match="broken"):
         export(scene, tmp_path / "out", degree=0)
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["notes.txt"]
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["lod-meta.json", "notes.txt"]
+    assert (tmp_path / "out" / "lod-meta.json").read_text() == "of an older export"

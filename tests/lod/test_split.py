@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import shutil
@@ -33,7 +34,6 @@ from hyrfpack.format.shared import CODEC_SHARED
 from hyrfpack.lod import LevelRenderer, split, split_model
 from hyrfpack.lod.errors import ERROR_RADII
 from hyrfpack.model import HybridModel
-from hyrfpack.outputs import indexed_folder
 from hyrfpack.render import render_view
 from tools.safety import minimal_reader
 from tools.safety.make_golden import GOLDEN_FOLDER, GOLDEN_SCENE_FOLDER, GOLDEN_SCENE_SOURCE
@@ -395,20 +395,34 @@ def test_an_existing_scene_is_replaced_only_with_permission_and_completely(copy)
     ]
 
 
+def fail_to_write(monkeypatch, name: str) -> None:
+    """Let the disk be full when the file of this name is written."""
+    real = Path.write_bytes
+
+    def write(path, data):
+        if path.name == name:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return real(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", write)
+
+
 def test_a_failure_leaves_no_half_written_folder(tmp_path, monkeypatch):
-    written, real = [], indexed_folder.write_atomic
-
-    def fail_third(path, *args, **options):
-        written.append(path)
-        if len(written) == 3:
-            raise HyrfError(f"{path}: the disk is full", fix="free space")
-        return real(path, *args, **options)
-
-    monkeypatch.setattr(indexed_folder, "write_atomic", fail_third)
-    with pytest.raises(HyrfError, match="disk is full"):
+    fail_to_write(monkeypatch, "chunk-0001-0.hyrf")
+    with pytest.raises(HyrfError, match=r"scene/chunk-0001-0\.hyrf: the disk is full"):
         split_model(COMPACT_FILE, tmp_path / "scene", SplitConfig(chunk_gaussians=400, levels=1), context=QUIET_CONTEXT)
 
-    assert len(written) == 3 and not (tmp_path / "scene").exists()
+    assert not (tmp_path / "scene").exists()
+
+
+@pytest.mark.parametrize("name", ["chunk-0001-0.hyrf", "scene.json"])
+def test_a_failure_while_a_scene_is_replaced_leaves_the_old_one(copy, monkeypatch, name):
+    before = {path.name: path.read_bytes() for path in copy.iterdir()}
+    fail_to_write(monkeypatch, name)
+    with pytest.raises(HyrfError, match="the disk is full"):
+        split_model(COMPACT_FILE, copy, SplitConfig(chunk_gaussians=200, levels=1), context=QUIET_CONTEXT)
+
+    assert {path.name: path.read_bytes() for path in copy.iterdir()} == before
 
 
 def test_a_scene_json_of_another_program_makes_no_scene(tmp_path):
