@@ -130,7 +130,8 @@ class _Pool:
         """Return the share (H, W, 3) of each pixel's light of up to three sets (chunks,) bool, at the finest levels."""
         index = torch.from_numpy(np.flatnonzero(self.level_of == 0))
         none = np.zeros(len(sets[0]), bool)
-        members = np.stack([each[self.chunk_of[index]] for each in (*sets, none, none)[:_COLUMNS]], axis=1)
+        # A tensor of one element would index an array as an integer does.
+        members = np.stack([each[self.chunk_of[index.numpy()]] for each in (*sets, none, none)[:_COLUMNS]], axis=1)
         model = self.model
         if isinstance(model, MergedModel):
             gaussians, frame = gather_geometry(model, camera, index, self.decoded), camera_frame(model, camera)

@@ -17,10 +17,11 @@ import torch
 from commands import hyrfpack, refused, succeeded
 from json_schema import matches
 from layers import only_in_acceptance
-from scenes import ball_scene
+from scenes import ball_scene, ring, shift_cameras, small_model
 
-from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.capture import Capture, provenance_cameras
 from hyrfpack.cameras.files import camera_to_numbers
+from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.config.split import SplitConfig
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError, HyrfFormatError
@@ -33,7 +34,7 @@ from hyrfpack.format.sections import SECTION_CONTENTS
 from hyrfpack.format.shared import CODEC_SHARED
 from hyrfpack.lod import LevelRenderer, split, split_model
 from hyrfpack.lod.errors import ERROR_RADII
-from hyrfpack.model import HybridModel
+from hyrfpack.model import Frame, HybridModel
 from hyrfpack.render import render_view
 from tools.safety import minimal_reader
 from tools.safety.make_golden import GOLDEN_FOLDER, GOLDEN_SCENE_FOLDER, GOLDEN_SCENE_SOURCE
@@ -163,6 +164,27 @@ def test_the_box_of_a_chunk_holds_its_gaussians(folder):
         model = scene.load_chunk(number)
         means = model.config.frame.to_world(model.gaussians.positions.numpy())
         assert (means >= np.array(chunk.low)).all() and (means <= np.array(chunk.high)).all()
+
+
+def split_around(folder: Path, positions: np.ndarray, frame: Frame, levels: int) -> SceneFolder:
+    """Split a model of Gaussians at local positions, whose cameras surround them."""
+    model, cameras = small_model(positions, frame=frame, fields=2.0), ring(4, radius=3 * frame.scale, width=32)
+    cameras = shift_cameras(cameras, frame.center)
+    kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
+    save_model(model, folder / "model.hyrf", provenance=kept)
+    config = SplitConfig(chunk_gaussians=64, levels=levels, refit_steps=1)
+    split_model(folder / "model.hyrf", folder / "scene", config, context=QUIET_CONTEXT)
+    return SceneFolder(folder / "scene")
+
+
+def test_a_model_of_one_gaussian_can_be_split(tmp_path, monkeypatch):
+    monkeypatch.setattr(split, "MEASURED_VIEWS", 1)
+    monkeypatch.setattr(split, "REFIT_CAMERAS", 1)
+
+    scene = split_around(tmp_path, np.zeros((1, 3)), Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0)), levels=2)
+
+    assert [level.gaussians for level in scene.manifest.chunks[0].levels] == [1, 1]
+    assert len(scene.load()) == 1
 
 
 def test_a_coarse_level_has_a_quarter_of_the_gaussians_and_a_measured_error(folder):
