@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -62,6 +63,8 @@ REFIT_BETWEEN = 3  # views between cameras, for each view at a camera
 REFIT_CAMERAS, MAX_REFIT_CAMERAS = 12, 48
 MEASURED_VIEWS, MAX_MEASURED_VIEWS = 24, 64
 _SEED_STEP = 1000  # keeps the views that levels are fitted at from those that they are measured at
+MAX_BOX_GROWTH = 1e-5  # of a side, relative to the diagonal
+_MIN_BOX_SIZE = 1e-30
 _SIGMAS = 3.0
 _REFIT_SHARE, _MEASURE_SHARE = 0.6, 0.3  # of the progress
 
@@ -321,13 +324,25 @@ def _measure_boxes(part: _Part) -> list[tuple[tuple[float, float, float], tuple[
     for group in part.groups:
         low = (means[group] - reach[group, None]).min(axis=0)
         high = (means[group] + reach[group, None]).max(axis=0)
-        boxes.append((_rounded(low), _rounded(high)))
+        boxes.append(_round_outwards(low, high))
     return boxes
 
 
-def _rounded(values: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = (float(f"{value:.7g}") for value in values)
-    return x, y, z
+def _round_outwards(low: np.ndarray, high: np.ndarray) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Round the corners of a box to few decimal places, so that the box grows by at most MAX_BOX_GROWTH of its size.
+
+    The places depend on the size of the box and not on the coordinates, which may be large map coordinates.
+    """
+    size = float(np.linalg.norm(high - low))
+    places = math.ceil(-math.log10(MAX_BOX_GROWTH * max(size, _MIN_BOX_SIZE)))
+
+    def round_down(value: float) -> float:
+        rounded = round(value, places)
+        return rounded if rounded <= value else min(round(rounded - 10.0**-places, places), value)
+
+    lows, highs = map(round_down, low.tolist()), map(round_down, (-high).tolist())
+    (a, b, c), (d, e, f) = lows, highs
+    return (a, b, c), (-d, -e, -f)
 
 
 def _checksum(data: bytes) -> str:

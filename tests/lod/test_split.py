@@ -177,6 +177,22 @@ def split_around(folder: Path, positions: np.ndarray, frame: Frame, levels: int)
     return SceneFolder(folder / "scene")
 
 
+def test_boxes_of_a_small_object_in_map_coordinates_keep_its_size(tmp_path):
+    frame = Frame((4_027_893.7, 1_307_045.2, 4_919_474.9), 0.2, (1.0, 1.0, 1.0))
+    positions = np.random.default_rng(0).uniform(-0.6, 0.6, (256, 3))
+
+    scene = split_around(tmp_path, positions, frame, levels=1)
+
+    for number, chunk in enumerate(scene.manifest.chunks):
+        model = scene.load_chunk(number)
+        means = frame.to_world(model.gaussians.positions.numpy())
+        reach = 3 * frame.scale * model.decode_geometry().scales.amax(dim=1).double().numpy()[:, None]
+        low, high = (means - reach).min(axis=0), (means + reach).max(axis=0)
+        excess = np.concatenate((low - chunk.low, chunk.high - high))
+        assert (excess >= 0).all() and (excess < 1e-4 * np.linalg.norm(high - low)).all()
+        assert all(len(repr(value)) <= len("-4027893.712345") for value in (*chunk.low, *chunk.high))
+
+
 def test_a_model_of_one_gaussian_can_be_split(tmp_path, monkeypatch):
     monkeypatch.setattr(split, "MEASURED_VIEWS", 1)
     monkeypatch.setattr(split, "REFIT_CAMERAS", 1)
