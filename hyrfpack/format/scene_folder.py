@@ -205,7 +205,7 @@ class SceneFolder:
     def load(
         self, levels: Sequence[int | None] | None = None, device: str | torch.device = "cpu"
     ) -> HybridModel | MergedModel:
-        """Return a model of all chunks; a merged model if the scene has several parts.
+        """Return a model of all chunks, with fields of its own; a merged model if the scene has several parts.
 
         Args:
             levels: level of each chunk, 0 for the finest and None to leave it out; None for the finest of all.
@@ -222,13 +222,15 @@ class SceneFolder:
         chunks = [None if level is None else self.load_chunk(number, level) for number, level in enumerate(chosen)]
         model = self.join(chunks)
         for part in parts_of(model):
+            # The next call needs the fields as they are, wherever this model moves.
+            part.geometry, part.radiance = deepcopy(part.geometry), deepcopy(part.radiance)
             part.to(device)
         return model
 
     def join(self, chunks: Sequence[HybridModel | None]) -> HybridModel | MergedModel:
         """Return a model of all chunks, given the model of each at any level; a merged model of several parts.
 
-        A chunk without a model is left out.
+        A chunk without a model is left out. The model shares `fields`.
         """
         from hyrfpack.format.scene_model import join_parts
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
+from copy import deepcopy
+from functools import cached_property
 
 import torch
 
@@ -12,6 +14,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.format.scene_folder import SceneFolder
 from hyrfpack.lod.select import LevelSelection, select_levels
 from hyrfpack.model import HybridModel
+from hyrfpack.model.field import Field
 from hyrfpack.model.merged import MergedModel, parts_of
 from hyrfpack.render import RenderedPicture, RenderSettings
 from hyrfpack.render.files import make_renderer
@@ -65,7 +68,7 @@ class LevelRenderer:
     def load(self, camera: Camera) -> tuple[HybridModel | MergedModel, LevelSelection]:
         """Return a model of the levels that are chosen for a view, and the choice.
 
-        Views with the same levels in a row share one model.
+        Views with the same levels in a row share one model. All models of a renderer share their fields.
 
         Raises:
             HyrfFormatError: a file is missing or damaged.
@@ -95,10 +98,19 @@ class LevelRenderer:
     def _join(self, levels: list[int | None]) -> HybridModel | MergedModel:
         chunks = [None if level is None else self._chunk(number, level) for number, level in enumerate(levels)]
         model = self.scene.join(chunks)
-        for part in parts_of(model):
+        for part, (geometry, radiance) in zip(parts_of(model), self._fields, strict=True):
+            part.geometry, part.radiance = geometry, radiance
             part.to(self._device)
             part.precision = self._precision
         return model
+
+    @cached_property
+    def _fields(self) -> list[tuple[Field, Field]]:
+        """The fields of each part on the device. They are copies, because moving them would move those of `scene`."""
+        return [
+            (deepcopy(part.geometry).to(self._device), deepcopy(part.radiance).to(self._device))
+            for part in self.scene.fields
+        ]
 
     def _chunk(self, number: int, level: int) -> HybridModel:
         key = (number, level)

@@ -41,6 +41,7 @@ from tools.safety.make_golden import GOLDEN_FOLDER, GOLDEN_SCENE_FOLDER, GOLDEN_
 
 COMPACT_FILE, RAW_FILE = (GOLDEN_FOLDER / "trained" / name for name in ("demo_compact.hyrf", "demo.hyrf"))
 QUIET_CONTEXT = RunContext(progress=None)
+CAMERA = ring(1)[0]
 
 
 @pytest.fixture(scope="module")
@@ -234,6 +235,22 @@ def test_views_with_the_same_levels_share_one_decoded_model(folder, cameras, mon
     assert torch.equal(pictures[0], pictures[2]) and not torch.equal(pictures[0], pictures[1])
     renderer.gaussians = 800
     assert torch.equal(renderer.draw(cameras[0]).rgb, LevelRenderer(scene, gaussians=800).draw(cameras[0]).rgb)
+
+
+@pytest.mark.parametrize("load", [SceneFolder.load, lambda scene: LevelRenderer(scene).load(CAMERA)[0]])
+def test_a_loaded_model_can_be_moved_without_an_effect_on_others(folder, load):
+    scene = SceneFolder(folder)
+    first, second = load(scene), load(scene)
+    before = {name: values.clone() for name, values in second.state_dict().items()}
+
+    first.to(torch.float64)
+    with torch.no_grad():
+        for values in first.parameters():
+            values.zero_()
+
+    for model in (second, load(scene)):
+        for name, values in model.state_dict().items():
+            assert values.dtype == before[name].dtype and torch.equal(values, before[name]), name
 
 
 def test_a_budget_below_the_coarsest_levels_leaves_chunks_out(folder, cameras):
