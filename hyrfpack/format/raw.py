@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from hyrfpack.errors import HyrfFormatError
@@ -12,15 +14,20 @@ from hyrfpack.model.hybrid import HybridModel
 CODEC_FLOAT32 = 1
 
 
-def encode(model: HybridModel) -> tuple[list[Section], dict]:
+def encode(model: HybridModel, groups: Sequence[str] | None = None) -> tuple[list[Section], dict]:
     """Encode a model; return its sections and the settings used (none).
+
+    Args:
+        model: the model.
+        groups: types of the sections to encode; None for all.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
+    arrays = to_arrays(model)
     sections = [
-        Section(group, CODEC_FLOAT32, values.astype("<f4").tobytes(), 4 * values.size)
-        for group, values in to_arrays(model).items()
+        Section(group, CODEC_FLOAT32, arrays[group].astype("<f4").tobytes(), 4 * arrays[group].size)
+        for group in (arrays if groups is None else groups)
     ]
     return sections, {}
 

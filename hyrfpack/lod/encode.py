@@ -11,8 +11,16 @@ import torch
 
 from hyrfpack.compress.channels import MIN_STEP_CODE, requantize_channel
 from hyrfpack.compress.plan import snap_to_lattice
+from hyrfpack.format import raw
 from hyrfpack.format.arrays import grid_configs, layered_groups, residual_widths, to_arrays
-from hyrfpack.format.compact.channels import Channel, decode_channel, encode_channel, read_channel_header
+from hyrfpack.format.compact.channels import (
+    BASIS_BYTES,
+    Channel,
+    decode_channel,
+    encode_channel,
+    read_basis,
+    read_channel_header,
+)
 from hyrfpack.format.compact.groups import encode_use_classes
 from hyrfpack.format.compact.plan import USAGE_CLASS_COUNT, build_step_groups
 from hyrfpack.format.compact.quantized import (
@@ -25,7 +33,6 @@ from hyrfpack.format.compact.quantized import (
 )
 from hyrfpack.format.container import Container, Section, read_container, write_container
 from hyrfpack.format.metadata import Metadata, read_metadata, writer_name
-from hyrfpack.format.raw import CODEC_FLOAT32
 from hyrfpack.format.sections import (
     COLORS,
     LOGIT_SECTIONS,
@@ -142,7 +149,7 @@ class ChunkEncoder:
     @cached_property
     def _basis(self) -> np.ndarray:
         """The basis of colour logits, (3, 3) float64."""
-        return np.frombuffer(self._file[COLORS].data[:36], "<f4").reshape(3, 3).astype(np.float64)
+        return read_basis(memoryview(self._file[COLORS].data)[:BASIS_BYTES]).astype(np.float64)
 
     @cached_property
     def _layers(self) -> list[LayerNumbers]:
@@ -151,7 +158,8 @@ class ChunkEncoder:
             points = decode_points(self._file[layer_section(POSITIONS, number)].data, count)
             values, headers = [], []
             for group in LOGIT_SECTIONS:
-                data = memoryview(self._file[layer_section(group, number)].data)[36 if group == COLORS else 0 :]
+                start = BASIS_BYTES if group == COLORS else 0
+                data = memoryview(self._file[layer_section(group, number)].data)[start:]
                 for _ in range(LOGIT_COLUMNS[group]):
                     headers.append(read_channel_header(data))
                     numbers, data = decode_channel(data, points.classes)
@@ -172,7 +180,7 @@ class ChunkEncoder:
     def _encode_shared(self) -> bytes:
         """Return the bytes of the shared file: a model without Gaussians."""
         config = self.model.config
-        empty = [Section(group, CODEC_FLOAT32, b"", 0) for group in layered_groups(config)]
+        empty = [Section(group, raw.CODEC_FLOAT32, b"", 0) for group in layered_groups(config)]
         sections = [self._file[tag] for tag in SHARED_SECTIONS if tag in self._file]
         for place, section in enumerate(sections):
             if section.type in TABLE_SECTIONS and section.codec == CODEC_GROUPS:
@@ -197,11 +205,7 @@ class ChunkEncoder:
         return Section(layer_section(group, layer), CODEC_RESIDUALS, stored, 4 * self._residual_widths[group] * count)
 
     def _write_raw(self, model: HybridModel) -> bytes:
-        arrays = to_arrays(model)
-        sections = [
-            Section(group, CODEC_FLOAT32, arrays[group].astype("<f4").tobytes(), 4 * arrays[group].size)
-            for group in layered_groups(model.config)
-        ]
+        sections, _ = raw.encode(model, layered_groups(model.config))
         return self._write(sections, [len(model)])
 
     def _write(self, sections: list[Section], counts: list[int]) -> bytes:
