@@ -90,19 +90,21 @@ def bench(
     from hyrfpack.bench.suite import benchmark_model as measure
     from hyrfpack.evaluate.figures import require_matplotlib
     from hyrfpack.format import describe_file
+    from hyrfpack.format.input_folder import find_input_folder
     from hyrfpack.measure.machine import format_machine
 
     model = None if model is None else resolve_model_file(model)
     plot_format(output)
     require_matplotlib()
     scene = None if data is None or model is None else read_scene(data, reader_options, describe_file(model))
-    outputs = Outputs(model, scene=scene, overwrite=overwrite)
+    folder = None if model is None else find_input_folder(model)
+    outputs = Outputs(model, folder=folder, scene=scene, overwrite=overwrite)
     outputs.file(output)
     page = _read_page(markdown)
     if page:  # check before minutes of work that the page has a place for each table
         tables.fill_page(page, dict.fromkeys(("machine", *(only or BENCH_GROUPS)), ""), str(markdown))
     if markdown is not None:  # an existing page with places is filled, which needs no permission to overwrite
-        Outputs(model, scene=scene, overwrite=overwrite or bool(page)).file(markdown)
+        Outputs(model, folder=folder, scene=scene, overwrite=overwrite or bool(page)).file(markdown)
     with notes_only_of("hyrfpack.bench"):
         result = measure(model, scene, repeats=repeats, only=only or None)
     if as_json:

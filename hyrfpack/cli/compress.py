@@ -161,9 +161,10 @@ def decompress(file: Path, output: Path, fraction: float | None, overwrite: bool
       hyrfpack decompress bonsai.hyrf -o coarse.hyrf --fraction 0.6
     """
     from hyrfpack.format import repack
+    from hyrfpack.format.input_folder import find_input_folder
 
     file = resolve_model_file(file)
-    Outputs(file, overwrite=overwrite).file(output, ".hyrf")
+    Outputs(file, folder=find_input_folder(file), overwrite=overwrite).file(output, ".hyrf")
     result = repack(file, output, fraction=fraction, overwrite=overwrite)
     note_rename(output, result.file)
     if as_json:

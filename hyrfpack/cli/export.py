@@ -117,6 +117,7 @@ def export(
     from hyrfpack.export.folder import check_folder, export_gallery, export_player
     from hyrfpack.export.kinds import PLAYER_FOLDER, check_place, check_request, find_file_kind
     from hyrfpack.format import describe_file, find_model
+    from hyrfpack.format.input_folder import find_input_folder
     from hyrfpack.splats.names import is_splats
 
     config = ExportConfig(**settings)
@@ -143,7 +144,8 @@ def export(
     if kind is PLAYER_FOLDER:
         check_folder(output, models, scenes, overwrite=overwrite, is_gallery=len(models) > 1)
     else:
-        check_place(output, Outputs(*files, scene=scenes[0] if scenes else None, overwrite=overwrite), config)
+        folder, scene = find_input_folder(files[0]), scenes[0] if scenes else None
+        check_place(output, Outputs(*files, folder=folder, scene=scene, overwrite=overwrite), config)
     if len(models) > 1:
         report = export_gallery(
             models,

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import count as count_up
+from itertools import zip_longest
 from pathlib import Path
 
 from PIL import Image
@@ -28,6 +29,7 @@ from hyrfpack.export.poster import (
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
 from hyrfpack.format import describe_file
+from hyrfpack.format.input_folder import find_input_folder
 from hyrfpack.format.run_folder import name_model
 from hyrfpack.format.scene_folder import SceneFolder, is_scene, single_file
 from hyrfpack.lock import exclusive_folder
@@ -268,8 +270,9 @@ def check_folder(
     names += [README_NAME, INDEX_NAME, *encode_player_files()]
     names += [GALLERY_PLAYER_NAME, GALLERY_STYLE_NAME] if is_gallery else [ELEMENT_SCRIPT_NAME]
     files = [find_playable_file(source) for source in sources]
-    for scene in scenes or [None]:
-        Outputs(*files, scene=scene, overwrite=overwrite).folder(folder, names)
+    input_folders = [find_input_folder(file) for file in files] or [None]
+    for input_folder, scene in zip_longest(input_folders, scenes):
+        Outputs(*files, folder=input_folder, scene=scene, overwrite=overwrite).folder(folder, names)
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,7 @@ from hyrfpack.export.source import Source
 from hyrfpack.export.streamed_sog import write_streamed_sog
 from hyrfpack.export.tiles import write_tiles
 from hyrfpack.format import find_model
+from hyrfpack.format.input_folder import find_input_folder
 from hyrfpack.format.scene_folder import SceneFolder, single_file
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
@@ -125,11 +126,13 @@ def export_model(
     if kind is HTML_PAGE and not config.baked:
         suggest_compression(source)
     scene = open_levels(source) if kind in LEVEL_FOLDERS else None
-    with single_file(find_model(source)) as file:
-        return _export_file(file, scene, target, kind, config, data, overwrite, context)
+    model = find_model(source)
+    with single_file(model) as file:
+        return _export_file(model, file, scene, target, kind, config, data, overwrite, context)
 
 
 def _export_file(
+    model: Path,
     source: Path,
     scene: SceneFolder | None,
     target: str | os.PathLike[str],
@@ -139,12 +142,20 @@ def _export_file(
     overwrite: bool,
     context: RunContext,
 ) -> ExportReport:
-    """Export a `.hyrf` file, or the levels of `scene`, if it is given. Other arguments are those of `export_model`."""
+    """Export a `.hyrf` file, or the levels of `scene`, if it is given.
+
+    Args:
+        model: path of the model, whose files are not replaced.
+        source: the single file of the model; that of a scene folder is temporary.
+        scene: the scene folder whose levels are exported, or None.
+        target, kind, config, data, overwrite, context: arguments of `export_model`, and the kind of the target.
+    """
+    folder = find_input_folder(model)
     is_folder = kind is COLMAP_FOLDER or kind in LEVEL_FOLDERS
     if is_folder:
-        check_place(target, Outputs(source, scene=data, overwrite=True), config)
+        check_place(target, Outputs(model, folder=folder, scene=data, overwrite=True), config)
     with exclusive_folder(target) if is_folder else nullcontext():
-        check_place(target, Outputs(source, scene=data, overwrite=overwrite), config)
+        check_place(target, Outputs(model, folder=folder, scene=data, overwrite=overwrite), config)
         loaded = Source.read(source, data)
         if kind is HTML_PAGE and not config.baked:
             return write_native_page(loaded, source, target, config, overwrite)

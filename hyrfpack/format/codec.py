@@ -19,6 +19,7 @@ from hyrfpack.format.container import Container, Section, raw_bytes_limit, read_
 from hyrfpack.format.decode import decode_container
 from hyrfpack.format.exposure import encode_exposure
 from hyrfpack.format.info import FileReport, section_sizes
+from hyrfpack.format.input_folder import find_input_folder
 from hyrfpack.format.metadata import Metadata, gaussian_limit, read_metadata
 from hyrfpack.format.part_names import list_parts
 from hyrfpack.format.parts import write_parts
@@ -195,7 +196,7 @@ def repack(
             call is kept, and a free file name in the same folder is used, which the report contains.
     """
     source = find_model(source)
-    Outputs(source, overwrite=overwrite).file(target)
+    Outputs(source, folder=find_input_folder(source), overwrite=overwrite).file(target)
     parts = []
     for name, model, provenance in load_parts(source, fraction):
         stored_provenance = provenance if profile == "raw" else packed_provenance(provenance, model)

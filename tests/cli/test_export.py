@@ -163,6 +163,15 @@ def test_a_page_embeds_the_model_unless_it_is_baked(model, tmp_path):
     assert "is copied unchanged" in result.stderr
 
 
+@pytest.mark.parametrize("command", ["decompress", "export"])
+def test_a_chunk_of_the_scene_that_is_read_is_never_replaced(tmp_path, command):
+    folder = Path(shutil.copytree(GOLDEN_SCENE_FOLDER, tmp_path / "scene"))
+    name = {"decompress": "shared.hyrf", "export": "scene.json"}[command]
+
+    assert "input itself" in refused(command, folder, "-o", folder / name, "--overwrite")
+    assert (folder / name).read_bytes() == (GOLDEN_SCENE_FOLDER / name).read_bytes()
+
+
 def test_folders_are_players_and_galleries(model, photographed_model, data, tmp_path):
     succeeded("export", "-o", tmp_path / "empty")
     succeeded("export", model, "-o", tmp_path / "player")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -36,6 +37,7 @@ GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
 FOUR_CAMERAS = ring(4)
 CROP_BOX = (-0.3, -10, -10, 0.4, 10, 0.2)
 SPLAT_SUFFIXES = (*FORMATS, ".html")
+GOLDEN_SCENE = Path(__file__).parents[1] / "golden" / "scene"
 
 
 def export(source, target, **options) -> ExportReport:
@@ -579,3 +581,14 @@ def test_export_is_a_function_of_the_package(plain_file, tmp_path):
 def test_selecting_all_gaussians_copies_nothing(plain_file):
     splats = bake(load_model(plain_file), [], (0,))[0]
     assert select_splats(splats) is splats
+
+
+@pytest.mark.parametrize("name", ["scene.json", "new.ply", "new.html", ""])
+def test_nothing_is_exported_into_the_scene_folder_that_is_read(tmp_path, name):
+    folder = Path(shutil.copytree(GOLDEN_SCENE, tmp_path / "scene"))
+
+    with pytest.raises(HyrfError, match="the output is an input itself|reads what lies in this folder"):
+        hyrfpack.export_model(folder, folder / name)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
+        path.name: path.read_bytes() for path in GOLDEN_SCENE.iterdir()
+    }

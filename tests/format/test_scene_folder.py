@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hyrfpack.errors import HyrfError, HyrfFormatError
-from hyrfpack.format import describe_file, load_model
+from hyrfpack.format import describe_file, load_model, repack
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
 from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
 
@@ -97,6 +97,18 @@ def test_an_unusual_archive_is_no_scene(archives, tmp_path, case):
         SceneFolder(path)
     with pytest.raises(HyrfFormatError):
         load_model(path)
+
+
+@pytest.mark.parametrize("name", ["scene.json", "shared.hyrf", "chunk-0000-0.hyrf", "new.hyrf"])
+def test_nothing_is_decompressed_into_the_scene_folder_that_is_read(tmp_path, name):
+    folder = Path(shutil.copytree(GOLDEN_SCENE_FOLDER, tmp_path / "scene"))
+
+    for source in (folder, folder / "scene.json"):
+        with pytest.raises(HyrfError, match="the output is an input itself|reads what lies in this folder"):
+            repack(source, folder / name)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == {
+        path.name: path.read_bytes() for path in GOLDEN_SCENE_FOLDER.iterdir()
+    }
 
 
 def test_a_path_with_a_nul_character_is_no_scene():
