@@ -28,6 +28,12 @@ MIN_COARSE_CAMERAS = 14
 FALLBACK_ORBIT_CAMERAS = 48
 COARSE_POSE_STEPS_PER_SCENE_SCALE = 500
 
+# The key of a provenance that says what changed the model after its `psnr` was measured, and its values. An edit, which
+# changes more than compression, takes the place of the other value.
+PSNR_BEFORE_KEY = "psnr_before"
+PSNR_BEFORE_COMPRESSION = "compression"
+PSNR_BEFORE_EDIT = "an edit"
+
 MISMATCH_REMEDY = "name the photos and poses that it was trained on"
 # A stored camera matches a photo's camera that differs from it by no more than these two limits.
 _MAX_MATCH_DISTANCE_SCENE_SCALES = 5 / COARSE_POSE_STEPS_PER_SCENE_SCALE
@@ -69,7 +75,8 @@ def scene_provenance(scene: Scene) -> dict:
 def quantized_provenance(provenance: dict, scale: float, points: np.ndarray | None = None) -> dict:
     """Shorten a provenance for small files: round its numbers and replace "cameras" by fewer "coarse_cameras".
 
-    `psnr` stays as it is, and `psnr_before` says that compression has changed the model since it was measured.
+    `psnr` stays as it is, and `psnr_before` says that compression, or an earlier edit, has changed the model since it
+    was measured.
 
     MIN_COARSE_CAMERAS are kept, and more where these show the scene less finely than all of them. Their positions are
     rounded to about scale / COARSE_POSE_STEPS_PER_SCENE_SCALE, which is precise enough to render from there, but not to
@@ -83,7 +90,7 @@ def quantized_provenance(provenance: dict, scale: float, points: np.ndarray | No
     replaced = ("cameras", RATE_RATIO_KEY) if "cameras" in provenance else ()
     kept = {name: value for name, value in provenance.items() if name not in replaced}
     if "psnr" in kept:
-        kept.setdefault("psnr_before", "compression")
+        kept.setdefault(PSNR_BEFORE_KEY, PSNR_BEFORE_COMPRESSION)
     with suppress(TypeError, ValueError, ArithmeticError, KeyError):
         kept["viewpoint"] = Viewpoint.from_json(provenance["viewpoint"]).to_json(rounded=True)
     with suppress(TypeError, ValueError, ArithmeticError, KeyError):

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.cameras.capture import Capture, has_mean_exposure
+from hyrfpack.cameras.capture import PSNR_BEFORE_EDIT, PSNR_BEFORE_KEY, Capture, has_mean_exposure
 from hyrfpack.cameras.paths import estimate_up
 from hyrfpack.config.edit import Action, Background, Center, Crop, EstimateUp, Move, Refit, Remove, Up, Upright
 from hyrfpack.edit.refit import refit, score_region
@@ -58,6 +58,13 @@ class EditedPart:
         """Return whether all numbers of the Gaussians are as before."""
         before, after = (model.gaussians.parameters() for model in (self.before, self.after))
         return all(torch.equal(old, new) for old, new in zip(before, after, strict=True))
+
+    @property
+    def keeps_looks(self) -> bool:
+        """Return whether the model renders as before, but for its place in the world."""
+        before, after = self.before.config, self.after.config
+        keeps_background = before.background == after.background and before.solid == after.solid
+        return keeps_background and self.keeps_gaussians
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +157,10 @@ def apply_actions(edit: Edit, actions: Sequence[Action]) -> Edit:
     for name, after in zip(names, parts_of(state.model), strict=True):
         part, placement = sources[name], state.placement
         provenance = part.provenance if placement.is_identity else placement.move_provenance(part.provenance)
-        parts.append(replace(part, after=after, provenance=provenance))
+        edited = replace(part, after=after, provenance=provenance)
+        if "psnr" in provenance and not edited.keeps_looks:
+            edited = replace(edited, provenance={**provenance, PSNR_BEFORE_KEY: PSNR_BEFORE_EDIT})
+        parts.append(edited)
     if any(isinstance(action, Up | EstimateUp) for action in actions):
         viewpoint = state.capture.viewpoint
         camera = state.placement.move_camera(viewpoint.camera)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from hyrfpack.cameras.capture import PSNR_BEFORE_COMPRESSION, PSNR_BEFORE_EDIT, PSNR_BEFORE_KEY
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.checks import check_several, check_type
 from hyrfpack.counts import format_count
@@ -172,7 +173,7 @@ def export_gallery(
         folder: output folder; created if it is missing. Files with other names stay.
         data: photos of each scene, or None. Held-out photos score a model, and the list shows the score. Without them
             the list shows how well the model fits its training photos or the splats that it was imported from, if the
-            file states it. It says so if this was measured before compression.
+            file states it. It says so if this was measured before compression or an edit.
         overwrite: replace existing files; if False, an existing file is an error.
         title: title of the list. Default: the name of the folder.
         credit: text below the title of each scene.
@@ -338,8 +339,10 @@ def _describe_quality(path: StrPath, model: HybridModel | MergedModel, data: Sce
     quality = f"{stated:.1f} dB " + ("against the splats it was made of" if imported else "on its training photos")
     # Earlier versions did not store that a model was scored before compression. Training writes profile "raw".
     is_trained_and_compressed = not imported and facts["profile"] != "raw"
-    scored_before = provenance.get("psnr_before") == "compression" or is_trained_and_compressed
-    return f"{quality} before compression" if scored_before else quality
+    change = provenance.get(PSNR_BEFORE_KEY)
+    if change not in (PSNR_BEFORE_COMPRESSION, PSNR_BEFORE_EDIT):
+        change = PSNR_BEFORE_COMPRESSION if is_trained_and_compressed else None
+    return quality if change is None else f"{quality} before {change}"
 
 
 def _choose_file_names(sources: Sequence[StrPath], *, is_gallery: bool) -> list[tuple[str, str]]:

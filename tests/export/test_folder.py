@@ -11,16 +11,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scenes import ball_scene, ring, small_model
+from scenes import QUIET_CONTEXT, ball_scene, ring, small_model
 
 import hyrfpack
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
+from hyrfpack.config.edit import Background, CropSphere, Translate
 from hyrfpack.config.export import ExportConfig
+from hyrfpack.edit import edit_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.export import ExportReport, export_gallery, export_model, export_player
-from hyrfpack.format import load_model, save_model
+from hyrfpack.format import describe_file, load_model, save_model
 from hyrfpack.format.codec import repack
 
 GAUSSIAN_POSITIONS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 3))
@@ -217,6 +219,30 @@ def test_a_gallery_says_that_a_compressed_model_was_scored_before(model_file, tm
     repack(tmp_path / "small.hyrf", tmp_path / "raw.hyrf", "raw")
     export_gallery([tmp_path / name for name in ("old.hyrf", "small.hyrf", "raw.hyrf")], tmp_path / "g")
     assert (tmp_path / "g" / "index.html").read_text().count("24.3 dB on its training photos before compression<") == 3
+
+
+def test_a_gallery_says_that_an_edited_model_was_scored_before(model_file, tmp_path):
+    edits = {
+        "cropped": (model_file, [CropSphere((0.0, 0.0, 0.0), 0.5)]),
+        "background": (model_file, [Background((0.0, 0.0, 0.5))]),
+        "moved": (model_file, [Translate((1.0, 0.0, 0.0))]),
+    }
+    files = []
+    for name, (source, actions) in edits.items():
+        edit_model(source, tmp_path / f"{name}.hyrf", actions, context=QUIET_CONTEXT)
+        files.append(tmp_path / f"{name}.hyrf")
+    repack(files[0], tmp_path / "small.hyrf", "paper")
+    repack(model_file, tmp_path / "packed.hyrf", "paper")
+    edit_model(tmp_path / "packed.hyrf", tmp_path / "last.hyrf", [CropSphere((0.0, 0.0, 0.0), 0.5)])
+    files += [tmp_path / "small.hyrf", tmp_path / "last.hyrf"]
+
+    export_gallery(files, tmp_path / "g")
+
+    page = (tmp_path / "g" / "index.html").read_text()
+    quality = re.findall(r"24\.3 dB on its training photos( before [^<]+)?<", page)
+    edited = " before an edit"
+    assert quality == [edited, edited, "", edited, edited]
+    assert all(describe_file(file)["provenance"]["psnr"] == 24.3 for file in files)
 
 
 def test_a_gallery_shows_the_psnr_on_held_out_photos(model_file, tmp_path):
