@@ -58,7 +58,7 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, p
         group: build_step_groups(group, model.config, layers[0].points)
         for group in (*TABLE_SECTIONS, *DECODER_SECTIONS)
     }
-    return Plan(kept, tuple(layers), basis, groups, per_number)
+    return Plan(kept, tuple(layers), basis, groups, per_number, len(model))
 
 
 def distortion_per_number(model: HybridModel, distortion: float) -> float:

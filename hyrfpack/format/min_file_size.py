@@ -46,7 +46,7 @@ def min_file_bytes(provenance: dict | None = None, exposure: ExposureMap | None 
     no_points = LatticePoints(np.zeros((0, 3), np.int64), np.zeros(0, np.uint8), np.ones(1, np.int64))
     data, _, points = encode_points(no_points)
     groups = {group: build_step_groups(group, config, points) for group in (*TABLE_SECTIONS, *DECODER_SECTIONS)}
-    plan = Plan(np.zeros(0, np.int64), (Layer(points, data),), np.eye(3, dtype=np.float32), groups, 0.0)
+    plan = Plan(np.zeros(0, np.int64), (Layer(points, data),), np.eye(3, dtype=np.float32), groups, 0.0, 0)
     empty = Channel(np.float32(0), 0, np.zeros(1, np.uint8), np.zeros(0, np.int64), np.zeros(0))
     channels = {group: [empty] * count for group, count in LOGIT_COLUMNS.items()}
     symbols = {group: _zero_symbols(members) for group, members in groups.items()}

@@ -21,6 +21,7 @@ from hyrfpack.compress.plan import (
     importance_classes,
     make_plan,
     position_bits,
+    replan_moved,
 )
 from hyrfpack.compress.quantize import plan_and_quantize, quantize
 from hyrfpack.compress.sensitivity import Sensitivity, removal_error
@@ -373,3 +374,15 @@ def test_sections_declare_their_decoded_size() -> None:
         group: 4 * math.prod(shape) for group, shape in shapes.items()
     }
     assert settings["gaussians_before"] == 300
+
+
+def test_settings_state_the_number_of_gaussians_before_pruning() -> None:
+    model = random_model()
+    plan, sensitivity = plan_model(model, 1e-4), random_sensitivity(model)
+    planned = plan.apply(model)
+    moved_plan, moved = replan_moved(plan, planned)
+
+    for stored_model, stored_plan in ((planned, plan), (moved, moved_plan)):
+        _, settings = encode(stored_model, quantize(stored_model, stored_plan, sensitivity))
+
+        assert len(stored_model) < settings["gaussians_before"] == 300

@@ -48,6 +48,7 @@ class Plan:
         groups: groups of numbers of the tables and decoders that share a step, by section.
         distortion_per_number: mean squared error that each number may add to renders; the file states it, but no
             decoder needs it.
+        gaussians_before: number of Gaussians of the model before pruning; the file states it likewise.
     """
 
     kept: np.ndarray
@@ -55,6 +56,7 @@ class Plan:
     basis: np.ndarray
     groups: dict[str, StepGroups]
     distortion_per_number: float
+    gaussians_before: int
 
     def apply(self, model: HybridModel) -> HybridModel:
         """Return a model of the stored Gaussians, in file order, at their positions on the lattice.

@@ -105,7 +105,7 @@ def encode(model: HybridModel, quantized: QuantizedModel) -> tuple[list[Section]
         tag = layer_section(POSITIONS, layer)
         done[tag] = Section(tag, CODEC_POINTS, part.positions, 12 * len(part.points.classes))
     further = [layer_section(group, layer) for layer in range(1, len(plan.layers)) for group in groups]
-    settings = {"distortion": plan.distortion_per_number, "gaussians_before": len(model)}
+    settings = {"distortion": plan.distortion_per_number, "gaussians_before": plan.gaussians_before}
     return [done[tag] for tag in (*DECODER_SECTIONS, *groups, *TABLE_SECTIONS, *further)], settings
 
 
