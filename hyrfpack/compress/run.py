@@ -20,7 +20,7 @@ from hyrfpack.config.compress import CompressConfig
 from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError, named_in_errors
-from hyrfpack.format.codec import load_with_provenance, packed_provenance, repack, write_model
+from hyrfpack.format.codec import load_parts, load_with_provenance, packed_provenance, repack, write_model
 from hyrfpack.format.info import FileReport, describe_file
 from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.format.parts import write_merged
@@ -148,6 +148,8 @@ def _encode_merged(
     source: Path, config: CompressConfig, data: Scene | None, context: RunContext, progress: Progress
 ) -> tuple[EncodedCandidate, str]:
     """Encode all parts of a merged file within a limit; return the file, and the outcome of the search."""
+    if config.target_bytes is not None:
+        _check_merged_target(source, config.target_bytes)
     names, packers, start = list[str](), list[Packer](), 0.0
     for name, part, share in iterate_parts(source, part_of_progress(progress, 0.0, SEARCH_ENCODING_START_SHARE)):
         photos = None if packers else data
@@ -167,6 +169,12 @@ def _encode_merged(
     return encode_within_psnr_drop(
         merged.encode, merged.decode, merged.model, views, config.max_psnr_drop, start, searching
     )
+
+
+def _check_merged_target(source: Path, target_bytes: int) -> None:
+    """Raise HyrfError if no file of a part is as small as the target size of the merged file."""
+    for _, model, provenance in load_parts(source):
+        check_target_bytes(target_bytes, packed_provenance(provenance, model), model.exposure)
 
 
 def _encode_compact(

@@ -16,8 +16,9 @@ from scipy.spatial import Delaunay
 
 from hyrfpack.cameras.capture import Capture, provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
-from hyrfpack.compress import compress_model
+from hyrfpack.compress import compress_model, run
 from hyrfpack.compress.removals import measure_removals
+from hyrfpack.config.compress import CompressConfig
 from hyrfpack.config.edit import (
     Background,
     Center,
@@ -258,6 +259,13 @@ def test_all_parts_share_a_target_size(merged, tmp_path):
     assert 0.8 * limits.target_bytes < report.bytes_after == facts["bytes"] <= limits.target_bytes
     assert [part["profile"] for part in facts["parts"]] == ["compact", "compact"]
     assert f"{limits.target_bytes:,}" in report.found
+
+
+def test_a_target_below_the_smallest_file_is_refused_before_sensitivities_are_measured(merged, tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "measure_calibrated_sensitivity", lambda *arguments: pytest.fail("the measurement began"))
+
+    with pytest.raises(HyrfError, match="a target size of 5 bytes is below the smallest possible file"):
+        compress_model(merged, tmp_path / "out.hyrf", CompressConfig(target_bytes=5), context=QUIET_CONTEXT)
 
 
 @pytest.mark.acceptance
