@@ -161,7 +161,7 @@ def apply_actions(edit: Edit, actions: Sequence[Action]) -> Edit:
         if "psnr" in provenance and not edited.keeps_looks:
             edited = replace(edited, provenance={**provenance, PSNR_BEFORE_KEY: PSNR_BEFORE_EDIT})
         parts.append(edited)
-    if any(isinstance(action, Up | EstimateUp) for action in actions):
+    if state.has_chosen_up:
         viewpoint = state.capture.viewpoint
         camera = state.placement.move_camera(viewpoint.camera)
         turned = replace(viewpoint, center=state.center, up=state.up, camera=camera)
@@ -176,9 +176,11 @@ def _apply_action(action: Action, state: EditState) -> tuple[EditState, ActionRe
     if isinstance(action, EstimateUp):
         up, basis = estimate_up(state.photo_cameras("from which up could be estimated"))
         x, y, z = (up.round(4) + 0.0).tolist()  # adding 0.0 turns -0.0 into 0.0
-        return replace(state, up=up), replace(report, action=f"{Up((x, y, z))}, estimated from {basis}")
+        return replace(state, up=up, has_chosen_up=True), replace(
+            report, action=f"{Up((x, y, z))}, estimated from {basis}"
+        )
     if isinstance(action, Up):
-        return replace(state, up=unit_vector(action.direction)), report
+        return replace(state, up=unit_vector(action.direction), has_chosen_up=True), report
     if isinstance(action, Background):
         changed = partial(replace_config, background=False, solid=action.color)
         return replace(state, model=map_parts(changed, state.model)), report
@@ -216,7 +218,7 @@ def _keep(keep: np.ndarray, state: EditState) -> EditState:
         model=whole,
         cameras=[placement.move_camera(camera) for camera in capture.cameras],
         center=placement.move_point(capture.viewpoint.center),
-        up=placement.move_direction(capture.viewpoint.up),
+        up=state.up if state.has_chosen_up else placement.move_direction(capture.viewpoint.up),
         has_scene=False,
     )
 

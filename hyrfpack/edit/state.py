@@ -34,6 +34,7 @@ class EditState:
         held_out: the held-out photos, likewise.
         has_gains: whether the model was trained with per-image gains, so that photos differ from it in exposure.
         has_scene: whether the first part is the one that the photos show. An edit may leave nothing of that one.
+        has_chosen_up: whether an action chose `up`, which then also holds if the first part is left out.
     """
 
     source: Path
@@ -48,6 +49,7 @@ class EditState:
     held_out: Sequence[View] = ()
     has_gains: bool = False
     has_scene: bool = True
+    has_chosen_up: bool = False
 
     @property
     def capture(self) -> Capture:

@@ -205,6 +205,16 @@ def test_actions_after_the_first_part_is_left_out_use_the_cameras_of_the_next(me
         np.testing.assert_allclose(*(getattr(viewpoint, name) for viewpoint in viewpoints), atol=1e-9)
 
 
+def test_a_chosen_up_direction_outlasts_the_part_that_it_was_chosen_for(merged, tmp_path):
+    actions = [Up((1, 0, 0)), Rotate((0, 0, 1), 90), CropSphere((-0.4, 1.35, 0), 0.2)]
+
+    only_toy = edit_model(merged, tmp_path / "toy.hyrf", actions, context=QUIET_CONTEXT)
+
+    facts = describe_file(only_toy.file)
+    assert "parts" not in facts and facts["gaussians"] < 60
+    assert facts["provenance"]["viewpoint"]["up"] == pytest.approx((0, 1, 0))
+
+
 def test_a_message_about_a_part_that_cannot_be_compressed_names_file_and_part(merged, tmp_path):
     far = ball_points(30)[0] * 0.1 + np.array([0.0, 0.0, 500.0])
     save_model(small_model(far), tmp_path / "far.hyrf", provenance={"cameras": provenance_cameras(CAMERAS)})
