@@ -318,6 +318,8 @@ def _fit_prior(cells: np.ndarray, measured: np.ndarray, guess: np.ndarray) -> np
     If the estimate is almost zero everywhere, as for Gaussians that are far too small to be seen, the mean of the
     measurements takes its place.
     """
+    if not len(guess):
+        return guess
     if not guess.sum() > MIN_PRIOR_SUM:
         guess = np.ones_like(guess)
     sums = [np.bincount(cells, values, PRIOR_CELLS_PER_AXIS**3) for values in (measured, guess)]

@@ -77,8 +77,8 @@ def merge_models(
         overwrite: replace an existing file. If False, an existing file is an error.
 
     Raises:
-        HyrfError: a file cannot be read or written, `moves` names no source or two, there are too many parts, or some
-            models are antialiased and others not.
+        HyrfError: a file cannot be read or written, `moves` names no source or two, there are too many parts, a
+            model without Gaussians, or some models are antialiased and others not.
         TypeError: an action of `moves` is no move.
         ValueError: there is no source.
 
@@ -107,10 +107,14 @@ def merge_models(
                         f"{path}: with it there are more than {MAX_PARTS} parts, which a file cannot hold",
                         fix="merge fewer models",
                     )
+                count = read_metadata(part).gaussians
+                if not count:
+                    place = f"{path}: part '{name}'" if is_merged else path
+                    raise HyrfError(f"{place}: there is no Gaussian in it to merge", fix="leave it out")
                 antialiased[read_config(part).antialiased] = str(path)
                 data = _moved_bytes(part, placements[stem]) if stem in placements else self_contained_bytes(part)
                 taken = {other.name for other, _ in parts}
-                merged = MergedPart(_free_name(name, taken), str(path), read_metadata(part).gaussians, len(data))
+                merged = MergedPart(_free_name(name, taken), str(path), count, len(data))
                 parts.append((merged, data))
     if len(antialiased) > 1:
         raise HyrfError(

@@ -298,6 +298,12 @@ def test_an_estimate_of_zero_gives_the_mean_of_the_measurements(guess):
     assert combined.mean() == pytest.approx(measured.mean(), rel=0.1)
 
 
+@pytest.mark.filterwarnings("error")
+def test_estimates_of_no_gaussian_are_empty():
+    none = np.zeros(0)
+    assert combine_with_prior(none.astype(np.int64), none, none, 4).shape == (0,)
+
+
 @needs_triton
 @pytest.mark.skipif(not IS_INTERPRETED, reason="the transfers of a fake GPU are counted")
 def test_a_gpu_draws_signs_itself_and_accumulates_squares(monkeypatch):

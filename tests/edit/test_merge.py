@@ -144,6 +144,15 @@ def test_more_parts_than_a_file_holds_are_refused(tmp_path: Path, files: tuple[P
     assert not (tmp_path / "many.hyrf").exists()
 
 
+def test_a_model_without_gaussians_is_refused(tmp_path: Path, files: tuple[Path, Path]):
+    save_model(small_model(np.zeros((0, 3)), background=True), tmp_path / "empty.hyrf")
+
+    for sources in ((files[0], "empty.hyrf"), ("empty.hyrf", files[0])):
+        with pytest.raises(HyrfError, match=r"empty.hyrf: there is no Gaussian in it to merge"):
+            merge_models(sources, tmp_path / "both.hyrf")
+    assert not (tmp_path / "both.hyrf").exists()
+
+
 def test_an_action_that_is_no_move_is_a_type_error(tmp_path: Path, files: tuple[Path, Path]):
     with pytest.raises(TypeError, match="no move"):
         merge_models(files, tmp_path / "both.hyrf", {"balls": [Center()]})  # type: ignore[list-item]
