@@ -27,6 +27,7 @@ MAX_STORED_CAMERAS = MAX_SAMPLING_CAMERAS
 MIN_COARSE_CAMERAS = 14
 FALLBACK_ORBIT_CAMERAS = 48
 COARSE_POSE_STEPS_PER_SCENE_SCALE = 500
+MAX_COARSE_DECIMALS = 35  # of positions; enough for the smallest world that a frame can have, of scale 1e-30
 
 # The key of a provenance that says what changed the model after its `psnr` was measured, and its values. An edit, which
 # changes more than compression, takes the place of the other value.
@@ -105,7 +106,7 @@ def quantized_provenance(provenance: dict, scale: float, points: np.ndarray | No
         # Rounding a rotation moves the camera in proportion to its distance from the origin.
         decimals = (
             int(np.clip(np.ceil(np.log10(max(2 * farthest / scale, 1e-9) * COARSE_POSE_STEPS_PER_SCENE_SCALE)), 4, 9)),
-            int(np.clip(np.ceil(np.log10(COARSE_POSE_STEPS_PER_SCENE_SCALE / scale)), 0, 9)),
+            int(np.clip(np.ceil(np.log10(COARSE_POSE_STEPS_PER_SCENE_SCALE / scale)), 0, MAX_COARSE_DECIMALS)),
         )
         kept["coarse_cameras"] = [camera_to_numbers(camera, decimals) for camera in cameras]
     return kept

@@ -69,7 +69,7 @@ def test_cameras_come_from_photos_then_from_the_file_then_from_an_orbit():
     assert not Capture(make_description(), scene).is_synthetic
 
 
-@pytest.mark.parametrize("scale", [1e-4, 1.0, 250.0])
+@pytest.mark.parametrize("scale", [1e-30, 1e-12, 1e-4, 1.0, 250.0])
 @pytest.mark.parametrize("away", [0.0, 3e4])
 def test_coarse_cameras_approximate_the_original_cameras(scale, away):
     cameras = []
