@@ -36,7 +36,6 @@ def quantize_channel(
     distortion: float,
     error: ErrorModel | None = None,
     reach: int = 1,
-    weight: int | None = None,
 ) -> Channel:
     """Choose the step of each class and the symbol of each number of a channel.
 
@@ -48,14 +47,13 @@ def quantize_channel(
         error: error of candidate values; by default s (candidate - value)^2.
         reach: distance in steps of the furthest candidate from the nearest symbol; 0 takes the nearest and ignores
             the rate.
-        weight: weight of the prediction in sixteenths; None for the best of PREDICTION_WEIGHTS_SIXTEENTHS.
     """
     codes = choose_channel_codes(classes, sensitivity, distortion)
     steps = decode_step(codes)[classes]
     values = np.clip(values, -MAX_ABS_CHANNEL_VALUE, MAX_ABS_CHANNEL_VALUE)
     mean = np.float32(np.average(values, weights=1 / steps)) if len(values) else np.float32(0)
     target = np.rint((values - float(mean)) * FIXED_POINT_ONE).astype(np.int64)
-    weight = _choose_weight(target, steps) if weight is None else weight
+    weight = _choose_weight(target, steps)
 
     nearest = _nearest_chooser(target, steps)
     residuals, decoded = lift(len(target), weight, steps, nearest)

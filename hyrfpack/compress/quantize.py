@@ -52,7 +52,6 @@ def quantize(
     sensitivity: Sensitivity,
     *,
     reach: int = 1,
-    previous: QuantizedModel | None = None,
     sections: Collection[str] = (*LOGIT_SECTIONS, *RESIDUAL_SECTIONS, *TABLE_SECTIONS, *DECODER_SECTIONS),
     field_logits: np.ndarray | None = None,
 ) -> QuantizedModel:
@@ -63,7 +62,6 @@ def quantize(
         plan: its plan.
         sensitivity: the sensitivities that the plan was made from.
         reach: distance in steps of the furthest candidate from the nearest symbol; 0 takes the nearest.
-        previous: an earlier result for the same plan, whose prediction weights are reused.
         sections: the sections to quantise; a file needs all of them.
         field_logits: result of `field_opacity_logits(model)`, if it is known.
 
@@ -99,9 +97,8 @@ def quantize(
             cost = partial(_offset_error, error, members.start) if is_opacity and error else None
             own_reach = reach and OPACITY_REACH_STEPS if is_opacity else reach
             for column, values in enumerate(arrays[group][members].T):
-                weight = None if previous is None else previous.channels[layer][group][column].weight
                 jobs[f"{group} {layer} {column}"] = partial(
-                    quantize_channel, values, classes, weights[group][members], d, cost, own_reach, weight
+                    quantize_channel, values, classes, weights[group][members], d, cost, own_reach
                 )
         for group in residuals:
             jobs[f"{group} {layer}"] = partial(

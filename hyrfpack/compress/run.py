@@ -105,15 +105,20 @@ def _compress_single(
     with context.open_progress("compress") as progress:
         candidate, search_result, sensitivity = _encode_compact(source, config, data, context, progress)
     report = ranks.run_on_main(lambda: write_model(candidate.data, target, overwrite=overwrite))
-    total = sum(candidate.predicted_errors.values())
     return CompressionReport(
         **vars(report),
-        shares={part: error / (total or 1.0) for part, error in candidate.predicted_errors.items()},
-        error=candidate.measured_error or total,
+        shares=_error_shares(candidate),
+        error=candidate.measured_error or sum(candidate.predicted_errors.values()),
         found=search_result,
         finetuned=config.finetune_steps is not None,
         sensitivity=sensitivity,
     )
+
+
+def _error_shares(candidate: EncodedCandidate) -> dict[str, float]:
+    """Return the share of each entry in the predicted error of a file; zeros if there is no error."""
+    total = sum(candidate.predicted_errors.values())
+    return {part: error / (total or 1.0) for part, error in candidate.predicted_errors.items()}
 
 
 def _compress_merged(
@@ -129,9 +134,8 @@ def _compress_merged(
         with context.open_progress("compress") as progress:
             candidate, found = _encode_merged(source, config, data, context, progress)
         written = write_merged(candidate.data, target, overwrite=overwrite)
-        total = sum(candidate.predicted_errors.values())
-        shares = {part: error / (total or 1.0) for part, error in candidate.predicted_errors.items()}
-        return CompressionReport(**vars(written), shares=shares, error=total, found=found)
+        error = sum(candidate.predicted_errors.values())
+        return CompressionReport(**vars(written), shares=_error_shares(candidate), error=error, found=found)
     photos = data  # which show the first part, the scene
 
     def compress_part(loose: Path, packed: Path, progress: Progress) -> FileReport:

@@ -52,7 +52,6 @@ def write_colmap(
     cameras: Sequence[tuple[str, Camera]],
     folder: str | os.PathLike[str],
     points: Splats | None,
-    max_points: int = MAX_COLMAP_POINTS,
     *,
     overwrite: bool = True,
 ) -> None:
@@ -66,7 +65,6 @@ def write_colmap(
         cameras: names of the photos, relative to the photo folder, with their cameras.
         folder: output folder; created if it is missing.
         points: splats whose centres become points, or None for no points.
-        max_points: maximum number of points.
         overwrite: replace existing tables.
 
     Raises:
@@ -87,7 +85,7 @@ def write_colmap(
         model.add_image_with_trivial_frame(pycolmap.Image(name=name, image_id=image_id, camera_id=numbers[lens]), pose)
     if points is not None:
         solid = np.flatnonzero(points.opacities >= _MIN_POINT_OPACITY)
-        chosen = points[np.array(evenly_spaced(solid.tolist(), max_points), np.int64)]
+        chosen = points[np.array(evenly_spaced(solid.tolist(), MAX_COLMAP_POINTS), np.int64)]
         colors = np.round(255 * chosen.base_colors).astype(np.uint8)
         for position, color in zip(chosen.positions, colors, strict=True):
             model.add_point3D(position, pycolmap.Track(), color)

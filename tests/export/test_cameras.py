@@ -75,11 +75,12 @@ def test_photos_with_equal_intrinsics_share_a_colmap_camera(tmp_path):
     assert (model.num_reg_images(), model.num_points3D()) == (9, 0)
 
 
-def test_surplus_points_are_sampled_evenly(tmp_path):
+def test_surplus_points_are_sampled_evenly(tmp_path, monkeypatch):
     import pycolmap
 
+    monkeypatch.setattr("hyrfpack.export.cameras.MAX_COLMAP_POINTS", 11)
     points = random_splats()
-    write_colmap(random_named_cameras(2), tmp_path, points, max_points=11)
+    write_colmap(random_named_cameras(2), tmp_path, points)
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     picked = np.array([point.xyz for _, point in sorted(model.points3D.items())])
     np.testing.assert_array_equal(picked, points.positions[::2][np.linspace(0, 99, 11).round().astype(int)])
