@@ -10,7 +10,7 @@ from pathlib import Path
 from hyrfpack.atomic import write_atomic
 from hyrfpack.compress.limits import EncodedCandidate
 from hyrfpack.compress.packer import Packer
-from hyrfpack.data.masked_views import mask_view
+from hyrfpack.data.masked_views import mask_differing_pixels
 from hyrfpack.errors import HyrfError, named_in_errors
 from hyrfpack.format.container import Container, read_container
 from hyrfpack.format.info import FileReport
@@ -23,9 +23,6 @@ from hyrfpack.outputs import StrPath
 from hyrfpack.progress import Progress, part_of_progress
 from hyrfpack.render import render_view
 from hyrfpack.scene import View
-
-# A pixel shows the scene if the other parts change none of its channels by more.
-MAX_SCENE_DIFFERENCE = 8 / 255
 
 
 def is_merged(path: Path) -> bool:
@@ -122,13 +119,10 @@ def mask_scene_views(model: MergedModel, views: Sequence[View]) -> list[View]:
     decoded, alone = model.decode(), model.scene.decode()
     masked = []
     for view in views:
-        pictures = (
-            render_view(model, view.camera, decoded=decoded).rgb,
-            render_view(model.scene, view.camera, decoded=alone).rgb,
-        )
-        shows_scene = (pictures[0] - pictures[1]).abs().amax(-1) <= MAX_SCENE_DIFFERENCE
-        if shows_scene.any():
-            masked.append(mask_view(view, shows_scene.numpy(force=True)))
+        merged = render_view(model, view.camera, decoded=decoded).rgb
+        scene = render_view(model.scene, view.camera, decoded=alone).rgb
+        if (masked_view := mask_differing_pixels(view, merged, scene)) is not None:
+            masked.append(masked_view)
     if not masked:
         raise HyrfError(
             "other parts cover every pixel of the photos, so no loss of PSNR can be measured there",

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from hyrfpack.atomic import write_atomic
 from hyrfpack.compress import compress_model
 from hyrfpack.compress.merged import name_part
@@ -16,7 +14,7 @@ from hyrfpack.compress.run import check_request
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.config.edit import EditLimits
 from hyrfpack.context import RunContext
-from hyrfpack.data.masked_views import mask_view
+from hyrfpack.data.masked_views import mask_differing_pixels
 from hyrfpack.edit.apply import Edit, EditedPart
 from hyrfpack.errors import HyrfError, HyrfSizeError, named_in_errors
 from hyrfpack.format.codec import encode_model, packed_provenance, save_model, write_model
@@ -30,10 +28,6 @@ from hyrfpack.format.sections import PART_NAMES, SECTION_CONTENTS
 from hyrfpack.outputs import StrPath
 from hyrfpack.progress import part_of_progress
 from hyrfpack.scene import Scene, View
-
-# A pixel counts as unchanged by an edit if no channel differs by more. Gaussians that are hardly seen change pixels by
-# less, cuts and removed objects by more.
-MAX_UNCHANGED_DIFFERENCE = 8 / 255
 
 
 def check_limits(edit: Edit, profile: str | None, limits: EditLimits, data: Scene | None) -> None:
@@ -151,10 +145,9 @@ def _unchanged_photos(edit: Edit, data: Scene) -> Scene:
     """
     held_out: list[View] = []
     for view in data.test or data.train:
-        before, after = edit.render(view.camera)
-        unchanged: np.ndarray = ((after - before).abs().amax(-1) <= MAX_UNCHANGED_DIFFERENCE).numpy()
-        if unchanged.any():
-            held_out.append(mask_view(edit.after.placement.move_view(view), unchanged))
+        masked_view = mask_differing_pixels(edit.after.placement.move_view(view), *edit.render(view.camera))
+        if masked_view is not None:
+            held_out.append(masked_view)
     if not held_out:
         raise HyrfError(
             "the edit changes every pixel of the held-out photos, so no loss of PSNR can be measured there",
