@@ -7,8 +7,8 @@ const APPROACH_FACTOR = 0.5; // of the distance to a place that was tapped twice
 
 export class Navigation {
   // `keyTarget`, `isEmbedded`, `press` and `ignored` are those of Controls; without `keyTarget` there are no controls.
-  // `acted()` is called after any input,
-  // `picked(x, y)` when a place of the canvas, in CSS pixels, becomes the centre of orbits.
+  // `acted()` is called after any input, and `picked(x, y)` when a place of the canvas, in CSS pixels, becomes the
+  // centre of orbits.
   constructor(player, { keyTarget, isEmbedded, press, ignored, acted = () => {}, picked = () => {} }) {
     Object.assign(this, { player, picked });
     this.damper = new Damper(player);

@@ -23,7 +23,8 @@ export class RowPool {
   }
 }
 
-// Calls `visit(first, count)` for each run of consecutive rows in a rising list; `place` is that of the first in it.
+// Calls `visit(first, count, place)` for each run of consecutive rows in a rising list; `place` is the index of the
+// run's first row in the list.
 export function eachRun(rows, visit) {
   for (let place = 0, end; place < rows.length; place = end) {
     for (end = place + 1; rows[end] === rows[end - 1] + 1;) end++;

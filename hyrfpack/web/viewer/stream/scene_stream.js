@@ -18,7 +18,8 @@
 //                                            parts that were read, and the levels that are drawn at once
 //     {part: {number, part, model, place, exposure}}   a further part of the scene, or its fields again;
 //                                            if its model is null, they are dropped
-//     {chunk: {number, chunk, level, part, rows, explicit, logits, pixelSizes, balls}}   a level to upload to `rows`
+//     {chunk: {number, chunk, level, part, rows, explicit, logits, shapeResiduals, colorResiduals, pixelSizes, balls}}
+//                                            a level to upload to `rows`
 //     {swap: {number, chunk, from, to, mse}}   fade from the rows of one level to those of another one, which changes
 //                                            the picture by about `mse`
 //     {state: {ticket, isComplete, gaussians, resident, bytes, totalBytes, psnr, problem}}   of the view with this
