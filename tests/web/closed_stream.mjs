@@ -1,8 +1,9 @@
 // Streams a scene of copies of a chunk and closes the stream while chunks are decoded: `node closed_stream.mjs FOLDER`.
 //
 // Prints, as JSON, `late`: the number of requests for files after that; `refused`: for an answer that is longer than the
-// manifest says, and for one of a missing file, whether its request is cancelled; and `partials`: the number of files
-// whose beginnings are kept after the requests for 100 files were cancelled one after the other.
+// manifest says, and for one of a missing file, whether its request is cancelled; `partials`: the number of files whose
+// beginnings are kept after the requests for 100 files were cancelled one after the other; and `breaks`: how often the
+// connection breaks within a file before it is given up, if its request was cancelled 25 times before.
 
 import { setTimeout as wait } from "node:timers/promises";
 
@@ -44,5 +45,32 @@ for (let number = 0; number < 100; number++) {
   await wait(1);
 }
 queue.close();
-console.log(JSON.stringify({ late, refused, partials: queue.partials.size }));
+
+let body = null, isGivenUp = false, breaks = 0;
+const broken = new FileQueue("http://host/", {
+  received: () => {}, failed: () => (isGivenUp = true), changed: () => {},
+  send: async (_, { signal }) => {
+    const start = (controller) => {
+      body = controller;
+      body.enqueue(new Uint8Array(1));
+    };
+    signal.addEventListener("abort", () => body.error(signal.reason));
+    return new Response(new ReadableStream({ start }));
+  },
+});
+for (let count = 0; count < 25; count++) {
+  broken.want([file]);
+  await wait(5);
+  broken.want([]);
+  await wait(5);
+}
+broken.want([file]);
+while (!isGivenUp && breaks < 100) {
+  await wait(5);
+  body.error(new Error("the connection was reset"));
+  breaks++;
+  await wait(5);
+  broken.resume();
+}
+console.log(JSON.stringify({ late, refused, partials: queue.partials.size, breaks }));
 process.exit();

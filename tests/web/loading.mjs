@@ -4,8 +4,10 @@
 // manifest has arrived; `folderName`: the name that another one gives a scene in a folder whose name is no valid
 // address; `cancelled`: whether a file that is not read is no longer downloaded, and whether the whole file is not,
 // which a server sends in place of the rest of a broken download; `lifted`: what the controls of an embedded scene
-// report when a pointer is released that was pressed elsewhere; and `changes`: how many changes controls report when a
-// key that flies is pressed on their canvas, which lies in a dialog, and in a field of that dialog.
+// report when a pointer is released that was pressed elsewhere; `changes`: how many changes controls report when a key
+// that flies is pressed on their canvas, which lies in a dialog, and in a field of that dialog; and `partEvents`: the
+// player's events when a part of a scene folder arrives that has the first exposure map of the scene, each with whether
+// the scene has a map by then.
 
 globalThis.window = globalThis.self = globalThis;
 globalThis.document = { baseURI: "http://host/" };
@@ -24,6 +26,7 @@ globalThis.Worker = class {
 const { STREAMING } = await import("../../hyrfpack/web/viewer/stream/stream_loader.js");
 const { fetchedFile } = await import("../../hyrfpack/web/viewer/source.js");
 const { Controls } = await import("../../hyrfpack/web/viewer/controls.js");
+const { hasExposureMap } = await import("../../hyrfpack/web/viewer/exposure.js");
 
 const player = Object.assign(new EventTarget(), { renderer: { largest: [4096, 4096] }, maxGaussians: 1 });
 const createLoader = () => new STREAMING.StreamLoader({ player, workerAddress: "http://host/worker.js" });
@@ -80,6 +83,13 @@ const press = (target) => {
 };
 const changesOf = [press(canvas), press(new EventTarget())];
 
+const partEvents = [], place = { scale: 1 }, parts = [{ exposure: null, place }, { exposure: null, place }];
+player.scene = { near: 1, sortNear: 1, exposure: null, parts };
+player.emit = (name) => partEvents.push([name, hasExposureMap(player.scene)]);
+const streamed = Object.assign(createLoader(), { current: 1, fields: { addPart: () => {} } });
+streamed.addPart({ number: 1, part: 1, exposure: {}, place });
+
 const loaderError = error.constructor.name;
-console.log(JSON.stringify({ loaderError, folderName, cancelled: cancelled.slice(0, 2), lifted, changes: changesOf }));
+const result = { loaderError, folderName, cancelled: cancelled.slice(0, 2), lifted, changes: changesOf, partEvents };
+console.log(JSON.stringify(result));
 process.exit();

@@ -50,3 +50,11 @@ def test_answers_of_files_that_cannot_be_used_are_cancelled(closed_stream: dict)
 
 def test_few_beginnings_of_files_that_are_no_longer_wanted_are_kept(closed_stream: dict):
     assert closed_stream["partials"] == 32
+
+
+def test_cancelled_requests_do_not_count_as_breaks_of_the_connection(closed_stream: dict):
+    assert closed_stream["breaks"] == 21
+
+
+def test_a_part_with_the_first_exposure_map_of_its_scene_is_an_event(loading: dict):
+    assert loading["partEvents"] == [["exposure", True]]

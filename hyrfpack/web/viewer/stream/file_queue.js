@@ -131,7 +131,8 @@ export class FileQueue {
     } catch (error) {
       aborter.abort(); // the rest of an answer that is refused
       if (partial.isEncoded) forget(partial); // a range would be one of the compressed bytes
-      const isBroken = !(error instanceof UnusableFileError || error instanceof RetryError);
+      const isCancelled = this.requests.get(name) !== aborter;
+      const isBroken = !(isCancelled || error instanceof UnusableFileError || error instanceof RetryError);
       if (isBroken && partial.length && ++partial.breaks > MAX_BREAKS) refuse("its connection breaks again and again");
       throw error;
     } finally {

@@ -80,11 +80,11 @@ class StreamLoader extends Loader {
   // Handles a part whose fields have arrived or are dropped.
   addPart(part) {
     if (part.number !== this.current) return; // of a content that was lost with the device
-    const { exposure, place } = part;
-    const { scene } = this.player;
+    const { player } = this, { scene } = player, { exposure, place } = part;
     scene.parts[part.part] = { exposure, place };
     scene.near = Math.min(scene.near, place.scale * scene.sortNear);
     this.fields.addPart(part);
+    player.emit("exposure"); // its map may be the first one of the scene
   }
 
   // Handles a level that has arrived, or one that is to be drawn instead of another one.
