@@ -84,7 +84,7 @@ export interface SceneInfo {
 }
 
 export interface ViewerEvents {
-  /** A scene is loaded. */
+  /** A scene is loaded. If it was complete while a later load was pending, it is fired when that load fails. */
   ready: { scene: SceneInfo };
   /** The part of the scene that is loaded, 0 to 1. */
   progress: { progress: number };
@@ -118,7 +118,7 @@ export interface Viewer {
 
   /**
    * Loads another scene; the present one stays until it is ready. Rejects with a sentence for the user, which the event
-   * "error" has, too, or with an AbortError if yet another scene is loaded.
+   * "error" has, too, or with an AbortError if yet another scene is loaded or the viewer is destroyed.
    */
   load(source: Source, options?: { name?: string }): Promise<void>;
   /** Glides to a camera. Throws an error if it is invalid or there is no scene. */

@@ -260,6 +260,53 @@ def test_frames_wait_for_their_own_order_after_a_preview(browser: Browser, site:
     assert size == 1 and browser.evaluate("sorted") == [False]
 
 
+DELAYED_LOAD_JS = (
+    "window.viewer = createViewer({ container: '#box' }); window.fired = 0;"
+    "viewer.on('ready', () => { window.fired++; });"
+    "window.stateOf = (promise) => promise.then(() => 'shown', ({ name }) => name);"
+    "window.startStream = () => new ReadableStream({ start: (controller) => { window.controller = controller; } });"
+    "window.bytes = new Uint8Array(await (await fetch('some scene.hyrf')).arrayBuffer());"
+    # While the scene is shown, its loader has not ended.
+    "const { player } = viewer, open = player.open.bind(player);"
+    "player.open = (file) => open(file).then(() => new Promise((done) => { window.end = done; }));"
+    "window.first = stateOf(viewer.load(bytes));"
+)
+
+
+def test_a_scene_that_is_complete_before_the_next_load_fails_becomes_ready(browser: Browser, site: Site):
+    open_viewer(browser, site, DELAYED_LOAD_JS)
+    wait_until(browser, "Boolean(window.end)")
+    browser.evaluate("(window.second = stateOf(viewer.load(startStream())), 0)")
+    assert browser.evaluate("end(), first") == "AbortError"
+    assert browser.evaluate("[viewer.isReady, fired]") == [False, 0], "the second scene is still being loaded"
+    assert browser.evaluate("controller.error(new Error('broken')), second") == "Error"
+    assert browser.evaluate("[viewer.isReady, viewer.progress, fired]") == [True, 1, 1]
+    assert "404" in error_of(browser, "viewer.load('gone.hyrf')")
+    assert browser.evaluate("[viewer.isReady, viewer.progress, fired]") == [True, 1, 1], "it is reported once"
+
+
+def test_a_scene_of_which_a_part_is_shown_becomes_ready_after_two_later_loads(browser: Browser, site: Site):
+    open_viewer(browser, site, DELAYED_LOAD_JS)
+    wait_until(browser, "Boolean(window.end)")
+    browser.evaluate("(window.second = stateOf(viewer.load(startStream())), 0)")
+    wait_until(browser, "viewer.player.next !== null")
+    assert "404" in error_of(browser, "viewer.load('gone.hyrf')")
+    assert browser.evaluate("second") == "AbortError"
+    assert browser.evaluate("[viewer.isReady, fired]") == [False, 0]
+    assert browser.evaluate("end(), first") == "shown"
+    assert browser.evaluate("[viewer.isReady, viewer.progress, fired]") == [True, 1, 1]
+
+
+def test_a_viewer_that_turns_stands_still_for_a_screenshot_and_turns_on(browser: Browser, site: Site):
+    open_viewer(browser, site, CREATE_JS.replace(" });", ", autorotate: true });"))
+    wait_until(browser, READY_JS)
+    late = "new Promise((done) => setTimeout(done, 20000, 'never'))"
+    picture = "viewer.screenshot().then(({ type }) => type)"
+    assert browser.evaluate(f"Promise.race([{picture}, {late}])") == "image/png"
+    text = browser.evaluate("viewer.cameraText")
+    wait_until(browser, f"viewer.cameraText !== {text!r}")
+
+
 def test_a_screenshot_is_completed_out_of_the_window(browser: Browser, site: Site):
     open_viewer(browser, site)
     wait_until(browser, READY_JS)
@@ -373,7 +420,9 @@ def test_destroy_ends_everything_and_can_be_repeated(browser: Browser, site: Sit
     with browser.before_every_page(COUNT_WORKERS_JS):
         open_viewer(browser, site)
     wait_until(browser, READY_JS)
+    browser.evaluate("window.pending = viewer.load('cloud.spz').then(() => '', ({ message }) => message), 0")
     browser.evaluate("window.gl = viewer.player.renderer.gl, viewer.destroy(), viewer.destroy(), 0")
+    assert "the viewer was destroyed" in browser.evaluate("pending")
     assert browser.evaluate("gl.isContextLost() && workers.alive === 0 && !document.querySelector('canvas')")
     assert "destroyed" in error_of(browser, "viewer.load('cloud.spz')")
     browser.evaluate("dispatchEvent(new Event('resize'))")

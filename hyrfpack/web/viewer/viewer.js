@@ -52,13 +52,15 @@ class Viewer {
       press: (key) => this.press(key),
       ignored: (kind) => this.emit("ignored", { kind }),
     });
+    const { turntable } = this.navigation, { isHeld } = turntable;
+    turntable.isHeld = () => this.screenshots > 0 || isHeld(); // the picture of a view that moves is never complete
     this.listeners = new Map(EVENTS.map((event) => [event, new Set()]));
     this.firstCamera = camera; // for the first scene
     this.progress = 0;
-    this.currentLoad = null; // identifies the load whose scene is wanted
+    // The load whose scene is wanted: {isComplete, isReported: whether "ready" was emitted}, `origin` of its loader.
+    this.currentLoad = null;
     this.screenshots = 0; // those that are being made
     this.isReady = false;
-    this.readyLoader = null; // that of the last scene that was loaded completely
     this.isDestroyed = false;
     this.isPaused = false; // by `pause`
     this.isVisible = true; // whether the container is in the window, or near it
@@ -97,7 +99,7 @@ class Viewer {
     player.addEventListener("failed", ({ detail }) => {
       if (!player.loaded) {
         this.isReady = false;
-        this.readyLoader = null;
+        if (player.loader?.origin) player.loader.origin.isComplete = false;
       }
       this.emit("error", { error: detail });
     });
@@ -147,7 +149,7 @@ class Viewer {
 
   async load(src, { name } = {}) {
     if (this.isDestroyed) throw new Error("The viewer has been destroyed; create another one.");
-    const { player, currentLoad: before } = this, thisLoad = Symbol(name);
+    const { player } = this, thisLoad = { isComplete: false, isReported: false };
     const isDropped = () => this.currentLoad !== thisLoad;
     this.currentLoad = thisLoad;
     if (player.next) player.discard(player.next); // an earlier scene that is not shown yet
@@ -157,18 +159,27 @@ class Viewer {
     try {
       const file = await openSource(src, name);
       if (isDropped()) file.stream.cancel?.();
-      else await player.open(file);
+      else await player.open({ ...file, origin: thisLoad });
     } catch (error) {
       if (isDropped() || error instanceof SupersededError) throw newAbortError();
-      this.currentLoad = before; // an earlier scene stays, of which only a part may be loaded
-      this.isReady = this.readyLoader !== null && this.readyLoader === player.loader;
-      if (this.isReady) this.progress = 1;
+      this.currentLoad = player.loader?.origin ?? null; // the scene that is shown stays; it may still be loading
+      this.progress = player.loader?.part ?? 0;
+      this.isReady = this.currentLoad !== null && this.currentLoad.isComplete;
       this.emit("error", { error });
+      this.reportReady();
       throw error;
     }
+    thisLoad.isComplete = true;
     if (isDropped()) throw newAbortError();
     this.isReady = true;
-    this.readyLoader = player.loader;
+    this.reportReady();
+  }
+
+  // Emits "ready", once for each load, if the scene is ready and no listener has destroyed the viewer.
+  reportReady() {
+    const { currentLoad } = this;
+    if (!this.isReady || !currentLoad || currentLoad.isReported) return;
+    currentLoad.isReported = true;
     this.emit("ready", { scene: this.scene });
   }
 
@@ -258,7 +269,8 @@ class Viewer {
   }
 }
 
-const newAbortError = () => new DOMException("Another scene was loaded instead.", "AbortError");
+const CANCELLED_TEXT = "The load was cancelled: another scene was loaded, or the viewer was destroyed.";
+const newAbortError = () => new DOMException(CANCELLED_TEXT, "AbortError");
 
 // Throws an Error if a value is not one of the allowed ones.
 function checkChoice(name, value, allowed) {
