@@ -287,6 +287,9 @@ def test_undo_and_redo_step_through_the_actions(browser: Browser, tmp_path: Path
         browser.evaluate(undo_key)
         assert list_actions(browser) == state
     assert wait_until_applied(browser) is None
+    assert read_text(browser, "status") == "Undone"
+    browser.evaluate(f"(document.getElementById('status').textContent = '', {undo_key})")
+    assert read_text(browser, "status") == "", "there was nothing to undo"
     for state in states[1:]:
         click(browser, "#edit-redo")
         assert list_actions(browser) == state
@@ -495,6 +498,23 @@ def test_saved_views_and_paths_are_cameras_that_render_reads(browser: Browser, t
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     assert steps[0] < 0.2 * steps.max() and steps[-1] < 0.2 * steps.max(), "it starts and ends at rest"
     assert steps[28:32].min() > 0.2 * steps.max() and np.abs(np.diff(steps)).max() < 0.2 * steps.max()
+
+
+def test_names_of_views_differ_and_are_those_of_their_buttons(browser: Browser, tmp_path: Path):
+    load_editable_page(browser, tmp_path, make_editable_page(make_model(50)), "views")
+    for _ in range(2):
+        click(browser, "#edit-new-view button")
+    click(browser, "#edit-views li:first-child button:last-child")
+    for _ in range(2):
+        click(browser, "#edit-new-view button")
+    names = "[...document.querySelectorAll('#edit-views input')].map(({ value }) => value)"
+    assert browser.evaluate(names) == ["view 2", "view 3", "view 4"]
+    fill(browser, "#edit-views input", " front ")
+    labels = "[...document.querySelectorAll('#edit-views li:first-child button')].map(({ ariaLabel }) => ariaLabel)"
+    assert browser.evaluate(labels) == ["Go to front", "Remove front"]
+    fill(browser, "#edit-views input", "  ")
+    assert browser.evaluate(names) == ["front", "view 3", "view 4"], "a view without a name"
+    assert browser.evaluate("hyrfpack.editor.tool.views.map(({ name }) => name)") == ["front", "view 3", "view 4"]
 
 
 def test_a_played_path_ends_at_the_last_view_and_stops_by_input(browser: Browser, tmp_path: Path):

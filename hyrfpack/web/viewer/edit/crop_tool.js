@@ -106,15 +106,15 @@ export class CropTool {
     const { player: { scene }, size } = editor, { factor, rows, up } = placementAfter(this.before, scene);
     const { value } = active;
     const turn = boxTurn(value, up), center = middleOf(value.slice(0, 3), value.slice(3, 6));
-    const turnBack = (vector) => rotateBack(frameAxes(scene), rotateBack(rows, vector));
-    const origin = mul(rotateBack(frameAxes(scene), scene.center), 1 / scene.unit);
+    const frame = frameAxes(scene), turnBack = (vector) => rotateBack(frame, rotateBack(rows, vector));
+    const origin = mul(rotateBack(frame, scene.center), 1 / scene.unit);
     const unit = 1 / (factor * scene.unit), toPage = (place) => sub(mul(turnBack(place), unit), origin);
     const corner = (...ends) => {
       const place = ends.map((end, axis) => value[axis + 3 * end]);
       return toPage(add(rotateBy(turn, sub(place, center)), center));
     };
     const axes = transpose(turn).map(turnBack);
-    const toWorld = (vector) => mul(rotateBy(rows, rotateBy(frameAxes(scene), vector)), 1 / unit);
+    const toWorld = (vector) => mul(rotateBy(rows, rotateBy(frame, vector)), 1 / unit);
     return { value, turn, corner, middle: toPage(center), axes, up: turnBack(up), unit, size, toWorld };
   }
 }

@@ -122,7 +122,7 @@ export class Editor {
     if (element("edit").hidden || !(event.ctrlKey || event.metaKey) || !["Z", "Y"].includes(key)) return;
     if (event.target.closest?.("input:not([type='range'], [type='checkbox'])")) return; // it has its own undo
     event.preventDefault();
-    this.go(isRedo ? 1 : -1);
+    element(isRedo ? "edit-redo" : "edit-undo").click(); // nothing happens if it is disabled
   }
 
   // Shows the state in the panel and over the scene.
@@ -130,7 +130,7 @@ export class Editor {
     const { scene } = this.player, { canUndo, canRedo } = this.history;
     element("edit-undo").disabled = !canUndo;
     element("edit-redo").disabled = !canRedo;
-    if (!scene || element("edit").hidden) return this.player.loaded && this.overlay.draw();
+    if (!scene || element("edit").hidden) return this.overlay.draw();
     const all = scene.count.toLocaleString("en"), left = (this.count ?? scene.count).toLocaleString("en");
     element("edit-count").textContent = this.count === 0
       ? "No Gaussian is left." : `${left === all ? all : `${left} of ${all}`} Gaussians`;

@@ -12,7 +12,8 @@ const MAX_SIDE_PIXELS = 1920; // of saved cameras
 
 export class ViewsTool {
   constructor(editor) {
-    Object.assign(this, { editor, views: [] }); // {name, pose: that of the eye}
+    this.editor = editor;
+    this.reset();
     element("edit-new-view").onsubmit = (event) => {
       event.preventDefault();
       this.add(element("edit-view-name").value.trim() || this.nextName);
@@ -24,7 +25,7 @@ export class ViewsTool {
   }
 
   get nextName() {
-    return `view ${this.views.length + 1}`;
+    return `view ${this.added + 1}`;
   }
 
   get seconds() {
@@ -45,23 +46,29 @@ export class ViewsTool {
   }
 
   reset() {
-    this.views = [];
+    this.views = []; // {name, pose: that of the eye}
+    this.added = 0; // the number of views that were added, also of those that were removed
   }
 
   add(name) {
     this.views.push({ name, pose: this.editor.player.eye.pose });
-    element("edit-view-name").value = this.nextName;
-    this.list();
+    this.added++;
+    this.enter();
   }
 
   // Lists the views, each with its name, a button that goes there, and one that removes it.
   list() {
     element("edit-views").replaceChildren(...this.views.map((view) => {
       const item = document.createElement("li"), name = document.createElement("input");
-      const rename = () => (view.name = name.value);
+      const go = createButton("Go", () => this.go(view)), remove = createButton("✕", () => this.remove(view));
+      const rename = () => {
+        view.name = name.value = name.value.trim() || view.name;
+        go.title = go.ariaLabel = `Go to ${view.name}`;
+        remove.title = remove.ariaLabel = `Remove ${view.name}`;
+      };
       Object.assign(name, { value: view.name, maxLength: 60, ariaLabel: "Name", onchange: rename });
-      item.append(name, createButton("Go", `Go to ${view.name}`, () => this.go(view)));
-      item.append(createButton("✕", `Remove ${view.name}`, () => this.remove(view)));
+      rename();
+      item.append(name, go, remove);
       return item;
     }));
     this.refresh();
@@ -80,11 +87,10 @@ export class ViewsTool {
   }
 
   play() {
-    const { navigation: { glide } } = this.editor;
-    if (this.isPlaying) return glide.stop();
+    if (this.isPlaying) return this.leave();
     const { poses } = this;
     this.isPlaying = true;
-    glide.follow((part) => poseOnPath(poses, part), this.seconds, () => {
+    this.editor.navigation.glide.follow((part) => poseOnPath(poses, part), this.seconds, () => {
       this.isPlaying = false;
       this.refresh();
     });
@@ -123,12 +129,12 @@ export class ViewsTool {
 
   refresh() {
     const { length } = this.views;
-    element("edit-seconds").nextElementSibling.textContent = `${Number(element("edit-seconds").value)} s`;
+    element("edit-seconds").nextElementSibling.textContent = `${element("edit-seconds").value} s`;
     element("edit-play").textContent = this.isPlaying ? "Stop" : "Play";
     element("edit-save-views").disabled = length < 1;
     element("edit-play").disabled = element("edit-save-path").disabled = length < 2;
   }
 }
 
-const createButton = (text, name, onclick) =>
-  Object.assign(document.createElement("button"), { textContent: text, title: name, ariaLabel: name, onclick });
+const createButton = (text, onclick) =>
+  Object.assign(document.createElement("button"), { textContent: text, onclick });
