@@ -41,7 +41,7 @@ from tools.safety.make_golden import GOLDEN_FOLDER, GOLDEN_SCENE_FOLDER, GOLDEN_
 
 COMPACT_FILE, RAW_FILE = (GOLDEN_FOLDER / "trained" / name for name in ("demo_compact.hyrf", "demo.hyrf"))
 QUIET_CONTEXT = RunContext(progress=None)
-CAMERA = ring(1)[0]
+FIRST_CAMERA = ring(1)[0]
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +237,7 @@ def test_views_with_the_same_levels_share_one_decoded_model(folder, cameras, mon
     assert torch.equal(renderer.draw(cameras[0]).rgb, LevelRenderer(scene, gaussians=800).draw(cameras[0]).rgb)
 
 
-@pytest.mark.parametrize("load", [SceneFolder.load, lambda scene: LevelRenderer(scene).load(CAMERA)[0]])
+@pytest.mark.parametrize("load", [SceneFolder.load, lambda scene: LevelRenderer(scene).load(FIRST_CAMERA)[0]])
 def test_a_loaded_model_can_be_moved_without_an_effect_on_others(folder, load):
     scene = SceneFolder(folder)
     first, second = load(scene), load(scene)
