@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 
 from hyrfpack.config.train import TrainConfig
@@ -23,6 +24,10 @@ from hyrfpack.train.trainer import Trainer
 BUDGET_REFERENCE_STEPS = 500  # By default a pilot has the budget of a run of this length.
 MAX_TRAINING_VIEWS = 150  # The shortest pilots have too few steps for more photos.
 MAX_VALIDATION_VIEWS = 8
+# Cameras nearer to each other than this share of the extent of all cameras are in one place, up to rounding.
+MIN_PLACE_DISTANCE_RATIO = 1e-6
+ROUNDING_RATIO = 1e-12  # Positions computed from poses differ by less than this share of them.
+MIN_PLACES = 3  # Of fewer places, none can be left out.
 MIN_TRAINING_VIEWS = 8  # With fewer photos, none can be spared for validation.
 # One of SSIM counts as much as this many dB of PSNR. In the mean of twelve sets, new versions that raise PSNR by 1 dB
 # raise SSIM by .022.
@@ -235,14 +240,33 @@ def split(
 
     Pilots train on the photos that are not validation photos. If these are more than `MAX_TRAINING_VIEWS`, only those
     nearest to a validation photo, in the order of views, are used. Photos spread over a large set would show too little
-    of each place.
+    of each place. Photos from one place, such as the faces of a panorama, are validated together: beside others of the
+    same place and exposure, a validation photo would hardly be new.
 
     Args:
-        every: one in `every` photos is a validation photo; None for 8, or 5 if there are fewer than 16 photos.
+        every: the photos of one in `every` places are validation photos; None for 8, or 5 if there are fewer than 16
+            places.
         max_validation: largest number of validation photos.
         number: number of the fold, from 0. Folds 0 to `every` - 1 have no validation photo in common.
     """
-    every = every or (8 if len(views) >= 16 else 5)
-    chosen = evenly_spaced(range((every // 2 + number) % every, len(views), every), max_validation)
-    others = sorted(set(range(len(views))) - set(chosen), key=lambda n: min(abs(n - place) for place in chosen))
+    places = _group_by_place(views)
+    every = min(every or (8 if len(places) >= 16 else 5), len(places))
+    tested = places[(every // 2 + number) % every :: every]
+    chosen = evenly_spaced([n for place in tested for n in place], max_validation)
+    left_out = {n for place in tested if not set(chosen).isdisjoint(place) for n in place}
+    others = sorted(set(range(len(views))) - left_out, key=lambda n: min(abs(n - other) for other in chosen))
     return [views[n] for n in sorted(others[:MAX_TRAINING_VIEWS])], [views[n] for n in chosen]
+
+
+def _group_by_place(views: Sequence[View]) -> list[list[int]]:
+    """Return the places of the views taken from one camera position, in the order of the first one.
+
+    If there are fewer than MIN_PLACES positions, each view is a place of its own.
+    """
+    centers = np.array([view.camera.position for view in views])
+    extent = float(np.ptp(centers, axis=0).max())
+    step = max(MIN_PLACE_DISTANCE_RATIO * extent, ROUNDING_RATIO * float(np.abs(centers).max())) or 1.0
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for number, center in enumerate(centers - centers.min(axis=0)):
+        groups.setdefault(tuple(np.rint(center / step).astype(np.int64)), []).append(number)
+    return list(groups.values()) if len(groups) >= MIN_PLACES else [[number] for number in range(len(views))]
