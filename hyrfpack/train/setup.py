@@ -23,6 +23,7 @@ from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
 from hyrfpack.scene import Scene
+from hyrfpack.train.median_color import median_color, start_fields_at
 from hyrfpack.train.provenance import training_provenance
 from hyrfpack.train.silhouette import inside_silhouettes
 from hyrfpack.train.surface_points import draw_surface_points
@@ -98,6 +99,15 @@ def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
     return budget, why
 
 
+def check_has_photos(scene: Scene) -> None:
+    """Raise HyrfTrainingError if a scene has no photos to train on."""
+    if not scene.train:
+        raise HyrfTrainingError(
+            f"{scene.path}: no views are left for training",
+            fix="use fewer test views (`test_every=0` trains on all)",
+        )
+
+
 def count_pixels(scene: Scene) -> int:
     """Return the number of pixels of all training photos."""
     return sum(view.camera.width * view.camera.height for view in scene.train)
@@ -167,11 +177,7 @@ def build_model(
         HyrfTrainingError: the scene has no training views.
         HyrfDataError: a photo cannot be read.
     """
-    if not scene.train:
-        raise HyrfTrainingError(
-            f"{scene.path}: no views are left for training",
-            fix="use fewer test views (`test_every=0` trains on all)",
-        )
+    check_has_photos(scene)
     preset, why_preset = (config.preset, "asked for") if config.preset != "auto" else detect_preset(scene)
     frame = scene_frame(scene, preset)
     budget, why_budget = budget_for(scene, config)
@@ -192,9 +198,12 @@ def build_model(
         direction_encoding=config.direction_encoding,
         antialiased=config.antialiased,
     )
-    pictures = (cache or PictureCache(0)) if config.surface_points else None
+    cache = cache or PictureCache(0)
+    color = median_color(scene, cache, np.array(model_config.solid, np.float32) if background else None)
+    pictures = cache if config.surface_points else None
     points, colors, source = initial_points(scene, frame, budget, config.seed, pictures)
     model = HybridModel(model_config, _gaussians(points, colors, model_config), _generator(config.seed))
+    start_fields_at(model, color)
     choices = {
         "preset": f"{preset}: {why_preset}",
         "max_gaussians": f"{budget:,}: {why_budget}",
@@ -211,47 +220,66 @@ def initial_points(
     """Choose initial points, at most as many as the budget.
 
     They are the scene's points, or a random subset of them. If there are fewer than the budget, `draw_surface_points`
-    adds others from photos read by `cache`; None adds none. A scene without points starts from points on surfaces
-    alone. Where these are fewer than half of the budget, random points in the box make up the rest; if photos have
-    transparency, these lie in the visual hull. Outliers are moved along the line to the frame's centre until half
-    precision can represent their coordinates.
+    adds others from photos read by `cache`; None adds none. If all these are fewer than half of the budget, because the
+    points are few or no photo shows them, random points in the box take their place as guides to surfaces. A scene
+    without points starts from surfaces alone, and random points make up half of the budget where these are few; if
+    photos have transparency, these lie in the visual hull. Outliers are moved along the line to the frame's centre
+    until half precision can represent their coordinates.
 
     Returns:
         Local positions (N, 3) float64, colours (N, 3) in [0, 1], and where they come from, in words.
     """
     generator = np.random.default_rng(seed)
-    if len(scene.points):
-        points, colors = scene.points, np.asarray(scene.point_colors, np.float64)
-        source = "points of the scene"
-        if len(points) > budget:
-            chosen = np.sort(generator.choice(len(points), budget, replace=False))
-            points, colors = points[chosen], colors[chosen]
-        elif len(points) < budget and cache is not None:
-            more, more_colors = draw_surface_points(scene, cache, budget - len(points), generator)
-            if len(more):
-                source = f"{len(points):,} points of the scene, the others on surfaces that photos show"
-                points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
-        return _representable(frame.to_local(points)), colors, source
-    count, half = max(1, budget // 2), np.array(frame.half_extent)
+    points, colors = scene.points, np.asarray(scene.point_colors, np.float64)
+    if len(points) > budget:
+        chosen = np.sort(generator.choice(len(points), budget, replace=False))
+        points, colors = points[chosen], colors[chosen]
+    given = len(points)
+    if 0 < given < budget and cache is not None:
+        more, more_colors = draw_surface_points(scene, cache, budget - given, generator)
+        points, colors = np.concatenate([points, more]), np.concatenate([colors, more_colors])
+    points = _representable(frame.to_local(points))
+    drawn, missing, where = len(points) - given, max(1, budget // 2) - len(points), ""
+    if missing > 0 and (cache is not None or not given):
+        random, random_colors, where = _random_points(scene, frame, max(1, budget // 2), generator)
+        if cache is not None:
+            # They say which photos show the same place, and how near surfaces can be.
+            guides = replace(
+                scene, points=frame.to_world(random), point_colors=random_colors.astype(np.float32), tracks={}
+            )
+            more, more_colors = draw_surface_points(guides, cache, budget - len(points), generator)
+            points = np.concatenate([points, _representable(frame.to_local(more))])
+            colors = np.concatenate([colors, more_colors])
+            drawn, missing = drawn + len(more), max(0, missing - len(more))
+        if not given:
+            points, colors = (
+                np.concatenate([points, random[:missing]]),
+                np.concatenate([colors, random_colors[:missing]]),
+            )
+    return points, colors, _source_in_words(given, drawn, len(points) - given - drawn, where)
+
+
+def _source_in_words(given: int, drawn: int, random: int, where: str) -> str:
+    """Say where initial points come from: of the scene, drawn on surfaces, and random ones at a place `where`."""
+    if given:
+        return (
+            f"{given:,} points of the scene, the others on surfaces that photos show"
+            if drawn
+            else "points of the scene"
+        )
+    if not random:
+        return "on surfaces that photos show"
+    return f"{drawn:,} on surfaces that photos show, the others random, {where}" if drawn else f"random, {where}"
+
+
+def _random_points(
+    scene: Scene, frame: Frame, count: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Draw random points: local positions (count, 3), colours (count, 3), and where they lie, in words."""
     if scene.has_alpha:
-        points, colors = inside_silhouettes(scene, frame, count, generator)
-        source = "random, inside the silhouettes"
-    else:
-        points, colors = generator.uniform(-half, half, (count, 3)), np.full((count, 3), 0.5)
-        source = "random, in the box"
-    if cache is not None:
-        # Random points take the place of the scene's: they say which photos show the same place, and how near surfaces
-        # can be.
-        guesses = replace(scene, points=frame.to_world(points), point_colors=colors.astype(np.float32), tracks={})
-        more, more_colors = draw_surface_points(guesses, cache, budget, generator)
-        missing = max(0, count - len(more))
-        points = np.concatenate([_representable(frame.to_local(more)), points[:missing]])
-        colors = np.concatenate([more_colors, colors[:missing]])
-        if not missing:
-            source = "on surfaces that photos show"
-        elif len(more):
-            source = f"{len(more):,} on surfaces that photos show, the others {source}"
-    return points, colors, source
+        return *inside_silhouettes(scene, frame, count, generator), "inside the silhouettes"
+    half = np.array(frame.half_extent)
+    return generator.uniform(-half, half, (count, 3)), np.full((count, 3), 0.5), "in the box"
 
 
 def _representable(local: np.ndarray) -> np.ndarray:

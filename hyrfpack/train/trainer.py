@@ -46,7 +46,7 @@ from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.provenance import training_background_spacing
 from hyrfpack.train.reserves import ReserveEstimator
 from hyrfpack.train.resolution import ResolutionSchedule
-from hyrfpack.train.setup import build_model, usual_budget_for
+from hyrfpack.train.setup import build_model, check_has_photos, usual_budget_for
 from hyrfpack.train.spacing import gaussian_spacing
 from hyrfpack.train.step_checks import MAX_GRADIENT
 from hyrfpack.train.step_graphs import StepGraphs
@@ -112,7 +112,12 @@ class Trainer:
                 fields start at lower learning rates (`FIELD_WARMUP_STEPS`).
             strategy: adds and removes Gaussians; None for `DensityControl` with the settings of `config.density`.
             ranks: the processes that train together; each of them sets up the same run.
+
+        Raises:
+            HyrfTrainingError: the scene has no training views.
+            HyrfDataError: a photo cannot be read.
         """
+        check_has_photos(scene)
         self.ranks = ranks
         self.steps = -(-config.steps // ranks.size)
         self.scene = scene
@@ -334,12 +339,10 @@ class Trainer:
         parameters, ssim_weight = self._learnt_parameters(), self.config.ssim_weight
         return compute_gradients(self.model, self.exposures, parameters, ssim_weight, shape, inputs)
 
-    def _upload_inputs(
-        self, view: View, picture: Picture, solid: np.ndarray | None, settings: RenderSettings
-    ) -> StepInputs:
+    def _upload_inputs(self, view: View, picture: Picture, solid: np.ndarray, settings: RenderSettings) -> StepInputs:
         """Return a photo and what else its gradients are computed from, on the device."""
         target, mask = self.photos.get(view.load, picture, solid)
-        behind = None if solid is None else upload_array(solid, self.device)
+        behind = None if self.model.config.background else upload_array(solid, self.device)
         row = None if self.exposures is None else self.exposures.row(view)
         if not self._reserves_memory:
             return StepInputs(target, mask, behind, row)
@@ -468,11 +471,9 @@ class Trainer:
             record = {"step": stats.step, "loss": stats.loss, "psnr": psnr, "gaussians": len(self.model)}
             self.records.append({**record, "seconds": round(self.elapsed, 3)})
 
-    def _solid(self, step: int) -> np.ndarray | None:
-        """Return the background colour (3,) of a step's view; None if the model has a background sphere."""
-        if self.model.config.background:
-            return None
-        if self.config.background_color == "random":
+    def _solid(self, step: int) -> np.ndarray:
+        """Return the colour (3,) behind transparent pixels of a step's photo, and behind a model without a sphere."""
+        if self.config.background_color == "random" and not self.model.config.background:
             number = (step - 1) * self.ranks.size + self.ranks.rank + 1  # The number of the view, from 1.
             return np.random.default_rng((self.config.seed, 1, number)).random(3, dtype=np.float32)
         return np.array(self.model.config.solid, np.float32)

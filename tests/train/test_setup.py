@@ -12,7 +12,7 @@ from hyrfpack.data.preset import detect_preset
 from hyrfpack.errors import HyrfDataError, HyrfTrainingError
 from hyrfpack.model import Frame
 from hyrfpack.scene import Picture, Scene, evenly_spaced
-from hyrfpack.train import TrainConfig
+from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.setup import (
     MAX_TARGETED_BUDGET_RATIO,
     MIN_TARGETED_BUDGET,
@@ -27,9 +27,10 @@ from hyrfpack.train.setup import (
 
 
 def make_rig_scene(cameras, points=None, **fields) -> Scene:
-    """Return a scene whose photos are never opened."""
+    """Return a scene whose photos show nothing."""
     points = np.zeros((0, 3)) if points is None else np.asarray(points, np.float64)
-    views = [view_of(f"{i:03d}.png", camera, None) for i, camera in enumerate(cameras)]
+    grey = Picture(np.full((2, 2, 3), 128, np.uint8))
+    views = [view_of(f"{i:03d}.png", camera, grey) for i, camera in enumerate(cameras)]
     return Scene("rig", fields.pop("layout", "colmap"), views, [], points, np.full((len(points), 3), 0.5), **fields)
 
 
@@ -328,7 +329,7 @@ def test_first_gaussians_look_like_the_points(encoding, noise):
 
     with torch.no_grad():
         geometry, colors = model.decode_geometry(), model.decode_colors(torch.zeros(3))
-        stored = torch.sigmoid(model.gaussians.color_logits)
+        stored = torch.sigmoid(model.gaussians.color_logits + model.radiance.biases[-1])
 
     sizes = np.sqrt((gaps**2).mean(1))
     assert sizes.max() < 0.49  # otherwise the test would measure the cap
@@ -342,7 +343,7 @@ def test_initial_sizes_outside_the_box_follow_the_point_distances_too():
     """S(p) grows there, so the stored fraction has to be smaller."""
     scene = ball_scene(points=60)
     far = Scene("far", "colmap", scene.train, [], scene.points + (30, 0, 0), scene.point_colors)
-    model, _, _ = build_model(far, TrainConfig())
+    model, _, _ = build_model(far, TrainConfig(surface_points=False))
     points = model.config.frame.to_local(far.points)
     gaps = np.sort(np.linalg.norm(points[:, None] - points[None], axis=2), axis=1)[:, 1:4]
     with torch.no_grad():
@@ -421,10 +422,11 @@ def test_building_does_not_use_the_global_random_generators():
     assert torch.equal(torch.rand(3), expected[0]) and np.array_equal(np.random.rand(3), expected[1])
 
 
-def test_a_scene_without_training_views_is_rejected():
-    scene = ball_scene()
+@pytest.mark.parametrize("build", [build_model, Trainer])
+def test_a_scene_without_training_views_is_rejected(build):
+    scene = dataclasses.replace(ball_scene(), train=[], test=ball_scene().train)
     with pytest.raises(HyrfTrainingError, match="no views are left for training"):
-        build_model(Scene("s", "colmap", [], scene.train, scene.points, scene.point_colors), TrainConfig())
+        build(scene, TrainConfig())
 
 
 def test_the_tests_photos_show_the_balls():

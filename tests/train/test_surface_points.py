@@ -250,6 +250,20 @@ def test_without_points_random_ones_guide_the_depth_maps():
     assert ((np.abs(z - 2.5) < 0.2) | (np.abs(z - 4) < 0.4)).mean() > 0.8
 
 
+@pytest.mark.parametrize("points", [[[50.0, 60.0, 70.0]] * 20, [[0.0, 0.0, 2.5]]], ids=["of another frame", "one"])
+def test_points_that_cannot_guide_the_depth_maps_do_no_harm(points):
+    """They are kept, and random points take their place as guides."""
+    scene = dataclasses.replace(
+        plane_scene(), points=np.array(points), point_colors=np.full((len(points), 3), 0.5, np.float32), tracks={}
+    )
+    frame = Frame.from_box(np.array([-3.0, -2.0, 1.0]), np.array([3.0, 2.0, 5.0]))
+    positions, colors, source = initial_points(scene, frame, 500, 0, PictureCache())
+    assert source == f"{len(points)} points of the scene, the others on surfaces that photos show"
+    assert positions.shape == colors.shape == (500, 3)
+    z = frame.to_world(positions[len(points) :])[:, 2]
+    assert ((np.abs(z - 2.5) < 0.2) | (np.abs(z - 4) < 0.4)).mean() > 0.8
+
+
 def test_random_points_make_up_the_rest_where_few_depths_are_known():
     """Else a few pixels, whose depths may be wrong, would get all points."""
     mask = np.zeros((48, 64), bool)

@@ -435,8 +435,8 @@ def test_a_photo_with_nan_stops_the_run_and_is_named():
     scene = make_scene()
     broken = np.array(scene.train[4].load().rgb, np.float32)
     broken[3, 5, 1] = np.nan
-    scene.train[4] = view_of("bad.png", scene.train[4].camera, Picture(broken))
     trainer = Trainer(scene, SHORT_CONFIG)
+    scene.train[4] = view_of("bad.png", scene.train[4].camera, Picture(broken))
     step = 1 + next(i for i, view in enumerate(trainer._order()) if view.name == "bad.png")
 
     with pytest.raises(HyrfTrainingError, match=rf"step {step} on view 'bad.png'.*not finite.*photo"):
