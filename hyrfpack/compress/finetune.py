@@ -186,7 +186,7 @@ class _Finetuner:
     def _backpropagate(self, view: View, picture: Picture) -> _BackpropagatedView:
         """Backpropagate the photometric loss of a view of the quantised model."""
         quantized = self.quantizer.quantize(self.model)
-        solid = None if self.model.config.background else np.array(self.model.config.solid, np.float32)
+        solid = np.array(self.model.config.solid, np.float32)
         target, mask = self.photos.get(view.load, picture, solid)
         reserve = None if self.reserves is None else self.reserves.estimate(view, len(self.model))
         with parameters_replaced(self.model, quantized.values):
@@ -284,7 +284,7 @@ def fit_residual_gains(
         (3,) gains on the model's device, by the name of the photo.
     """
     device = model.gaussians.positions.device
-    solid = None if model.config.background else np.array(model.config.solid, np.float32)
+    solid = np.array(model.config.solid, np.float32)
     decoded, gains = model.decode(), {}
     with closing((cache or PictureCache()).stream(views)) as pictures, torch_on_one_thread():
         for view, picture in pictures:

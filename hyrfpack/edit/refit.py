@@ -91,7 +91,7 @@ def refit(
     with closing(cache.stream(order)) as pictures, torch_on_one_thread(), freed_memory_kept():
         for step, (view, picture) in enumerate(pictures):
             progress(TaskEvent(f"training the region, step {step + 1}/{steps}", step / steps))
-            solid = None if model.config.background else np.array(model.config.solid, np.float32)
+            solid = np.array(model.config.solid, np.float32)
             target, mask = upload(picture, solid, torch.device("cpu"))
             settings = replace(resolution.render_settings(view.camera, step + 1), exposure=AS_PHOTOGRAPHED)
             image = render_view(trained, view.camera, settings).rgb
