@@ -21,7 +21,7 @@ from hyrfpack.data.archive import display_path
 from hyrfpack.data.equirectangular import CUBE_FACES, Face, FaceFile, cut_panorama, face_lens, face_size, is_panorama
 from hyrfpack.data.folder import PhotoFacts, read_photo_facts
 from hyrfpack.data.masks import MaskMatches, check_mask_shape
-from hyrfpack.data.pictures import open_picture, read_header, turn_upright
+from hyrfpack.data.pictures import open_picture, read_header, read_mask, turn_upright
 from hyrfpack.data.unusable import INVALID_NAME_REASON
 from hyrfpack.errors import HyrfDataError, short_reason, strip_path
 from hyrfpack.parallel.threads import thread_count
@@ -255,7 +255,9 @@ def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) ->
             elif mask.suffix.lower() == ".png":
                 copy_file(mask, target, keep_metadata=True)
             else:
-                image.convert("RGB").save(target)
+                # Black is exactly 0 in what is written: a PNG does not show that a JPEG was lossy.
+                usable = read_mask(mask, image.height, image.width)
+                Image.fromarray(usable.astype(np.uint8) * 255).save(target)
         made[photo.name] = target
     return made
 

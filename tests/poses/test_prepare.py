@@ -286,6 +286,18 @@ def test_masks_are_rotated_with_their_photos(tmp_path):
         assert np.array_equal(np.asarray(image), mask)
 
 
+def test_black_pixels_of_a_jpeg_mask_are_written_as_black(tmp_path):
+    save_photo(tmp_path / "photos" / "a.jpg", upright_picture())
+    y, x = np.mgrid[:60, :80]
+    mask = np.where((y - 30) ** 2 + (x - 40) ** 2 < 20**2, 0, 255).astype(np.uint8)
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(mask).save(tmp_path / "masks" / "a.jpg", quality=90)
+    photos, _ = read_photo_headers(tmp_path / "photos")
+    made = make_masks(photos, find_masks(photos, tmp_path / "masks", in_place=False).by_photo, tmp_path / "made")
+    with Image.open(made["a.jpg"]) as image:
+        np.testing.assert_array_equal(np.asarray(image), mask)
+
+
 @pytest.mark.parametrize("in_place, usable", [(False, {(80, 60), (60, 80)}), (True, {(60, 80)})])
 def test_a_mask_must_have_the_shape_of_its_photo(in_place, usable, tmp_path):
     save_photo(tmp_path / "photos" / "a.jpg", upright_picture(), 6)  # stored on its side
