@@ -14,7 +14,7 @@ import numpy as np
 from hyrfpack.counts import format_count
 from hyrfpack.data.equirectangular import CUBE_FACES, Face, FaceFile, face_lens, face_size
 from hyrfpack.data.folder import is_raw_name, list_pictures
-from hyrfpack.data.masks import check_mask_shape, find_masks
+from hyrfpack.data.masks import MaskedPhoto, choose_mask_orientations, find_masks
 from hyrfpack.data.names import find_similar_file
 from hyrfpack.data.pictures import (
     PhotoFile,
@@ -46,6 +46,7 @@ class Photo:
         mask: the file of the mask, if the poses name one.
         orientation: EXIF orientation to apply to the stored pixels; 1 unless the camera was calibrated on the upright
             picture.
+        mask_orientation: EXIF orientation to apply to the mask; 1 if it is upright.
         face: the face of a panorama that this photo is cut from, with its own name, header and lens; None otherwise.
         visible_points: (M,) int64 rows of the points that the format lists for the photo; None if it lists none.
     """
@@ -57,6 +58,7 @@ class Photo:
     camera_from_world: np.ndarray
     mask: Path | None = None
     orientation: int = 1
+    mask_orientation: int = 1
     face: Face | None = None
     visible_points: np.ndarray | None = None
 
@@ -106,6 +108,7 @@ def make_scene(
     if test_names is None:
         test_names = {photo.name for photo in photos[::test_every]} if test_every else set()
     photos, mask_notes = (photos, []) if masks is None else _assign_masks(photos, masks)
+    photos = _orient_masks(photos)
     photos, test_names = _cut_panoramas(photos, test_names)
     views = [_make_view(photo, max_size) for photo in photos]
     train = [view for view in views if view.name not in test_names]
@@ -132,11 +135,26 @@ def _assign_masks(photos: list[Photo], folder: Path) -> tuple[list[Photo], list[
     return [replace(photo, mask=found.by_photo.get(photo.name, photo.mask)) for photo in photos], found.notes
 
 
+def _orient_masks(photos: list[Photo]) -> list[Photo]:
+    """Check the shapes of the masks, and choose by which orientation each is turned."""
+    masked = {
+        # Panoramas are cut into faces as they are stored.
+        photo.name: MaskedPhoto(photo.mask, photo.header.size, 1 if _is_panorama(photo) else photo.orientation)
+        for photo in photos
+        if photo.mask is not None
+    }
+    orientations = dict(zip(masked, choose_mask_orientations(list(masked.values())), strict=True))
+    return [replace(photo, mask_orientation=orientations.get(photo.name, 1)) for photo in photos]
+
+
+def _is_panorama(photo: Photo) -> bool:
+    """Return whether a photo is a whole panorama, which is not yet cut into faces."""
+    return photo.lens.model == "equirectangular"
+
+
 def _cut_panoramas(photos: list[Photo], held_out: Set[str]) -> tuple[list[Photo], set[str]]:
     """Replace panoramas by the photos of their faces, and return these photos and the names of held-out ones."""
-    parts = {
-        photo.name: _panorama_faces(photo) if photo.lens.model == "equirectangular" else [photo] for photo in photos
-    }
+    parts = {photo.name: _panorama_faces(photo) if _is_panorama(photo) else [photo] for photo in photos}
     names = {part.name for name in held_out for part in parts.get(name, ())}
     return [part for cut in parts.values() for part in cut], names
 
@@ -297,7 +315,7 @@ def _panorama_faces(photo: Photo) -> list[Photo]:
 
 
 def _make_view(photo: Photo, max_size: int) -> View:
-    """Check a photo's lens, size, mask and pose, and make a view of it."""
+    """Check a photo's lens, size and pose, and make a view of it."""
     lens, header = photo.lens, photo.header
     if not _is_plausible(lens):
         raise HyrfDataError(
@@ -314,14 +332,12 @@ def _make_view(photo: Photo, max_size: int) -> View:
     size = fit_size(*header.size, max_size)
     if size != (lens.width, lens.height):
         lens = lens.scaled(*size)
-    whole = header.size if photo.face is None else read_header(photo.path).size
-    if photo.mask is not None:
-        check_mask_shape(photo.mask, whole, photo.orientation)
     pose = _orthonormal_pose(photo.camera_from_world, photo.path)
     camera = Camera(*size, lens.fx, lens.fy, lens.cx, lens.cy, pose)
     if photo.face is not None:
+        whole = read_header(photo.path).size
         return View(photo.name, camera, FaceFile(photo.path, whole, photo.face, size[0], photo.mask), is_resampled=True)
-    load = PhotoFile(photo.path, header.size, lens, photo.mask, photo.orientation)
+    load = PhotoFile(photo.path, header.size, lens, photo.mask, photo.orientation, photo.mask_orientation)
     return View(photo.name, camera, load, is_resampled=lens.is_distorted or photo.orientation != 1)
 
 

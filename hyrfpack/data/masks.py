@@ -18,6 +18,21 @@ _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
+class MaskedPhoto:
+    """A photo with a mask, as far as it matters for how the mask is turned.
+
+    Attributes:
+        mask: the file of the mask.
+        size: (width, height) of the upright photo.
+        orientation: EXIF orientation by which the stored photo is turned upright.
+    """
+
+    mask: Path
+    size: tuple[int, int]
+    orientation: int = 1
+
+
+@dataclass(frozen=True)
 class MaskMatches:
     """Masks that were found for photos.
 
@@ -102,32 +117,54 @@ def assign_masks(views: Sequence[View], folder: Path, others: Sequence[View] = (
         )
     for note in found.notes:
         _LOG.warning(note)
-    masked = []
-    for view in views:
-        if (mask := found.by_photo.get(view.name)) is not None:
-            load = loaders[view.name]
-            if isinstance(load, PhotoFile) and mask.resolve() == load.path.resolve():
-                raise HyrfDataError(f"{folder}: it holds the photos themselves", fix="name the folder of their masks")
-            check_mask_shape(mask, load.stored, load.orientation if isinstance(load, PhotoFile) else 1)
-            masked.append(replace(view, load=replace(load, mask=mask)))
-    return masked
+    masked_views = [view for view in views if view.name in found.by_photo]
+    masked_photos = []
+    for view in masked_views:
+        load, mask = loaders[view.name], found.by_photo[view.name]
+        if isinstance(load, PhotoFile) and mask.resolve() == load.path.resolve():
+            raise HyrfDataError(f"{folder}: it holds the photos themselves", fix="name the folder of their masks")
+        masked_photos.append(MaskedPhoto(mask, load.stored, load.orientation if isinstance(load, PhotoFile) else 1))
+    orientations = choose_mask_orientations(masked_photos)
+    return [
+        replace(view, load=_with_mask(loaders[view.name], photo.mask, orientation))
+        for view, photo, orientation in zip(masked_views, masked_photos, orientations, strict=True)
+    ]
 
 
-def check_mask_shape(path: Path, photo_size: tuple[int, int], orientation: int = 1) -> None:
-    """Raise HyrfDataError if a mask has another aspect ratio than its photo, also when it is turned like the photo.
+def _with_mask(load: PhotoFile | FaceFile, mask: Path, orientation: int) -> PhotoFile | FaceFile:
+    """Return the loader of a photo with another mask, which is turned by an EXIF orientation."""
+    if isinstance(load, PhotoFile):
+        return replace(load, mask=mask, mask_orientation=orientation)
+    return replace(load, mask=mask)  # panoramas are never turned
 
-    Args:
-        path: the mask.
-        photo_size: (width, height) of the upright photo.
-        orientation: EXIF orientation of the photo.
+
+def choose_mask_orientations(photos: Sequence[MaskedPhoto]) -> list[int]:
+    """Choose the EXIF orientation by which each mask is turned to fit its upright photo; 1 leaves the mask as it is.
+
+    Programs write masks either for the stored or for the upright photos. The shape of the mask shows which, if its
+    photo is turned by a quarter and not square. Masks of upside-down, mirrored and square photos fit both ways; they
+    stay as they are if the shapes of others show only upright masks, and are turned with their photos otherwise.
+
+    Raises:
+        HyrfDataError: a mask has another aspect ratio than its photo, also when it is turned like the photo.
     """
-    mask = read_header(path)
-    sizes = {mask.size, mask.turned(orientation).size}
-    if not any(has_same_aspect(*size, *photo_size) for size in sizes):
-        raise HyrfDataError(
-            f"{path}: the mask is {mask.width} x {mask.height} but its photo {photo_size[0]} x {photo_size[1]}",
-            fix="make it the photo's size",
-        )
+    fits_upright, fits_stored = [], []
+    for photo in photos:
+        header = read_header(photo.mask)
+        fits_upright.append(has_same_aspect(*header.size, *photo.size))
+        fits_stored.append(has_same_aspect(*header.turned(photo.orientation).size, *photo.size))
+        if not (fits_upright[-1] or fits_stored[-1]):
+            raise HyrfDataError(
+                f"{photo.mask}: the mask is {header.width} x {header.height} but its photo {photo.size[0]} x "
+                f"{photo.size[1]}",
+                fix="make it the photo's size",
+            )
+    fits = list(zip(fits_upright, fits_stored, strict=True))
+    are_ambiguous_stored = (False, True) in fits or (True, False) not in fits
+    return [
+        photo.orientation if stored and (are_ambiguous_stored or not upright) else 1
+        for photo, (upright, stored) in zip(photos, fits, strict=True)
+    ]
 
 
 def _unmatched_mask_notes(folder: Path, unmatched: list[Path], count: int, names: list[str]) -> list[str]:

@@ -70,6 +70,7 @@ class PhotoFile:
         lens: lens at the size to load, which is at most the stored size.
         mask: the file of the mask, if any.
         orientation: EXIF orientation by which stored pixels are turned.
+        mask_orientation: EXIF orientation by which the mask is turned; 1 if it is upright.
     """
 
     path: Path
@@ -77,6 +78,7 @@ class PhotoFile:
     lens: Lens
     mask: Path | None = None
     orientation: int = 1
+    mask_orientation: int = 1
 
     def __call__(self) -> Picture:
         width, height = size = (self.lens.width, self.lens.height)
@@ -88,10 +90,7 @@ class PhotoFile:
             raise self._size_changed_error()
         mask = None
         if self.mask is not None:
-            upright = has_same_aspect(*read_header(self.mask).size, *self.stored)
-            mask = read_mask(
-                self.mask, height, width, require_all=shrunk, orientation=1 if upright else self.orientation
-            )
+            mask = read_mask(self.mask, height, width, require_all=shrunk, orientation=self.mask_orientation)
         picture = Picture(rgb, alpha, mask)
         return undistort(picture, self.lens) if self.lens.is_distorted else picture
 

@@ -20,10 +20,10 @@ from hyrfpack.data import masks as mask_files
 from hyrfpack.data.archive import display_path
 from hyrfpack.data.equirectangular import CUBE_FACES, Face, FaceFile, cut_panorama, face_lens, face_size, is_panorama
 from hyrfpack.data.folder import PhotoFacts, read_photo_facts
-from hyrfpack.data.masks import MaskMatches, check_mask_shape
+from hyrfpack.data.masks import MaskedPhoto, MaskMatches, choose_mask_orientations
 from hyrfpack.data.pictures import open_picture, read_header, read_mask, turn_upright
 from hyrfpack.data.unusable import INVALID_NAME_REASON
-from hyrfpack.errors import HyrfDataError, short_reason, strip_path
+from hyrfpack.errors import HyrfDataError, strip_path
 from hyrfpack.parallel.threads import thread_count
 from hyrfpack.poses.job import Device
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
@@ -72,6 +72,10 @@ class Photo:
         """
         size = self.facts.size if self.face is None else read_header(self.facts.path).size
         return size[::-1] if in_place and self.facts.orientation >= 5 else size
+
+    def with_mask(self, mask: Path, in_place: bool) -> MaskedPhoto:
+        """Return the photo with its mask; the source is used as it is stored (`in_place`), or is turned upright."""
+        return MaskedPhoto(mask, self.source_size(in_place), 1 if in_place else self.facts.orientation)
 
 
 def read_headers(
@@ -218,8 +222,7 @@ def find_masks(photos: Sequence[Photo], folder: Path, in_place: bool) -> MaskMat
     sources = {photo.source: photo for photo in photos}  # one of the faces stands for their panorama
     sizes = {source: photo.source_size(in_place) for source, photo in sources.items()}
     found = mask_files.find_masks(folder, list(sizes.items()), set())
-    for source, mask in found.by_photo.items():
-        check_mask_shape(mask, sizes[source], 1 if in_place else sources[source].facts.orientation)
+    choose_mask_orientations([sources[source].with_mask(mask, in_place) for source, mask in found.by_photo.items()])
     by_name = {photo.name: found.by_photo[photo.source] for photo in photos if photo.source in found.by_photo}
     return replace(found, by_photo=by_name)
 
@@ -227,9 +230,9 @@ def find_masks(photos: Sequence[Photo], folder: Path, in_place: bool) -> MaskMat
 def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) -> dict[str, Path]:
     """Write upright masks into a new folder, under the photo's name + ".png"; return their paths by photo name."""
     made = {}
-    for photo in photos:
-        if photo.name not in masks:
-            continue
+    masked = [photo for photo in photos if photo.name in masks]
+    orientations = choose_mask_orientations([photo.with_mask(masks[photo.name], in_place=False) for photo in masked])
+    for photo, orientation in zip(masked, orientations, strict=True):
         mask, target = masks[photo.name], folder / f"{photo.name}.png"
         target.parent.mkdir(parents=True, exist_ok=True)
         if photo.face is not None:
@@ -237,27 +240,14 @@ def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) ->
                 photo.facts.path, photo.source_size(in_place=False), photo.face, photo.facts.size[0], mask
             )().mask
             assert usable is not None  # a FaceFile with a mask always loads one
+        else:
+            header = read_header(mask).turned(orientation)
+            usable = read_mask(mask, header.height, header.width, orientation=orientation)
+        if photo.face is None and orientation == 1 and mask.suffix.lower() == ".png":
+            copy_file(mask, target, keep_metadata=True)
+        else:
+            # Black is exactly 0 in what is written: a PNG does not show that a JPEG was lossy.
             Image.fromarray(usable.astype(np.uint8) * 255).save(target)
-            made[photo.name] = target
-            continue
-        with open_picture(mask) as image:
-            try:
-                image.load()
-            except Exception as error:  # Pillow's decoders raise many types of errors
-                raise HyrfDataError(
-                    f"{mask}: the mask cannot be decoded ({short_reason(error)})",
-                    fix="replace it",
-                ) from error
-            stored = photo.facts.size[::-1] if photo.facts.orientation >= 5 else photo.facts.size
-            turned = photo.facts.orientation != 1 and image.size == stored
-            if turned:
-                turn_upright(image, photo.facts.orientation).save(target)
-            elif mask.suffix.lower() == ".png":
-                copy_file(mask, target, keep_metadata=True)
-            else:
-                # Black is exactly 0 in what is written: a PNG does not show that a JPEG was lossy.
-                usable = read_mask(mask, image.height, image.width)
-                Image.fromarray(usable.astype(np.uint8) * 255).save(target)
         made[photo.name] = target
     return made
 

@@ -286,6 +286,26 @@ def test_masks_are_rotated_with_their_photos(tmp_path):
         assert np.array_equal(np.asarray(image), mask)
 
 
+@pytest.mark.parametrize("mask_scale", [1, 2])
+@pytest.mark.parametrize("masks_are_stored", [True, False])
+def test_masks_are_written_upright_whether_they_are_stored_like_the_photos_or_upright(
+    masks_are_stored, mask_scale, tmp_path
+):
+    mask = np.zeros((60 // mask_scale, 80 // mask_scale), np.uint8)
+    mask[:10, :15] = 255
+    (tmp_path / "masks").mkdir()
+    for number, orientation in enumerate([1, 3, 6, 8]):
+        save_photo(tmp_path / "photos" / f"{number}.jpg", upright_picture(number), orientation)
+        turns = QUARTER_TURNS_BY_ORIENTATION.get(orientation, 0) if masks_are_stored else 0
+        Image.fromarray(np.ascontiguousarray(np.rot90(mask, turns))).save(tmp_path / "masks" / f"{number}.png")
+    photos, _ = read_photo_headers(tmp_path / "photos")
+    made = make_masks(photos, find_masks(photos, tmp_path / "masks", in_place=False).by_photo, tmp_path / "made")
+    assert len(made) == 4
+    for name, path in made.items():
+        with Image.open(path) as image:
+            np.testing.assert_array_equal(np.asarray(image), mask, err_msg=name)
+
+
 def test_black_pixels_of_a_jpeg_mask_are_written_as_black(tmp_path):
     save_photo(tmp_path / "photos" / "a.jpg", upright_picture())
     y, x = np.mgrid[:60, :80]
