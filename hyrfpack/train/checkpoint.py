@@ -56,11 +56,17 @@ def save_checkpoint(
 
 @dataclass(frozen=True)
 class SavedDecisions:
-    """What pilot runs may have decided for the run of a checkpoint: settings of `TrainConfig`."""
+    """What pilot runs may have decided for the run of a checkpoint.
+
+    Attributes:
+        budget_factor, exposure, steps: settings of `TrainConfig`.
+        asked_steps: see `read_asked_steps`.
+    """
 
     budget_factor: float | None
     exposure: bool
     steps: int
+    asked_steps: int | None = None
 
 
 def saved_decisions(path: Path) -> SavedDecisions:
@@ -69,8 +75,10 @@ def saved_decisions(path: Path) -> SavedDecisions:
     Raises:
         HyrfTrainingError: the checkpoint is missing, damaged or of another version.
     """
-    saved = _read(path)[0]
-    decisions = SavedDecisions(saved.get("budget_factor"), saved.get("exposure", False), saved.get("steps", 0))
+    saved, _, progress = _read(path)
+    steps = saved.get("steps", 0)
+    asked_steps = read_asked_steps(progress, steps)
+    decisions = SavedDecisions(saved.get("budget_factor"), saved.get("exposure", False), steps, asked_steps)
     settings = list_settings(TrainConfig)
     try:
         settings["budget_factor"].check(decisions.budget_factor)
@@ -80,6 +88,25 @@ def saved_decisions(path: Path) -> SavedDecisions:
     if not isinstance(decisions.exposure, bool):
         raise damaged_checkpoint(path)
     return decisions
+
+
+def read_asked_steps(run: dict, steps: object) -> int | None:
+    """Return the number of steps that the user asked for when a run was started.
+
+    Args:
+        run: `choices` and `pilots` of the run, as a checkpoint or a training record stores them.
+        steps: number of steps of the run, which pilot runs may have chosen.
+
+    Returns:
+        The number; None if the run does not state it, as those of earlier versions.
+    """
+    choices, pilots = run.get("choices"), run.get("pilots")
+    asked: object = None
+    if isinstance(choices, dict) and "steps" not in choices:
+        asked = steps  # No pilot run chose it.
+    elif isinstance(pilots, list) and pilots and isinstance(pilots[-1], dict):
+        asked = pilots[-1].get("run_steps")
+    return asked if isinstance(asked, int) else None
 
 
 def load_checkpoint(path: Path, settings: dict) -> tuple[dict[str, torch.Tensor], dict]:

@@ -65,17 +65,22 @@ def measures_length(scene: Scene, config: TrainConfig) -> bool:
     return config.early_stop and max_length_pilot_steps(len(scene.train), config.steps) > 0
 
 
-def chosen_steps(scene: Scene, config: TrainConfig, steps: object) -> int:
+def chosen_steps(scene: Scene, config: TrainConfig, steps: object, asked_steps: int | None) -> int:
     """Return the number of steps with which a call completes an earlier run.
 
     Args:
         scene, config: photos and settings of the call.
         steps: number of steps of the earlier run, as read from a file.
+        asked_steps: number of steps that the earlier run was asked for; None if the file does not state it.
 
     Returns:
         `steps` if pilots may have chosen it for a run with these settings, else `config.steps`.
     """
-    could_be_chosen = measures_length(scene, config) and steps in pilot_lengths(config.steps, len(scene.train))
+    could_be_chosen = (
+        asked_steps in (None, config.steps)
+        and measures_length(scene, config)
+        and steps in pilot_lengths(config.steps, len(scene.train))
+    )
     return steps if could_be_chosen and isinstance(steps, int) else config.steps
 
 

@@ -43,7 +43,8 @@ class PilotScore:
     """The scores of one pilot run on the validation photos.
 
     Attributes:
-        steps, seed: number of steps and random seed of the run.
+        steps, seed: number of steps and random seed of the pilot run.
+        run_steps: number of steps that the user asked for, of the run that the pilot precedes.
         max_gaussians: Gaussian budget of the run.
         exposure: whether per-image gains were learnt, and renders exposed by the map fitted to them.
         psnr, ssim, psnr_corrected: means over the validation photos, see `hyrfpack.Evaluation`.
@@ -51,6 +52,7 @@ class PilotScore:
     """
 
     steps: int
+    run_steps: int
     seed: int
     max_gaussians: int
     exposure: bool
@@ -200,6 +202,7 @@ class ScenePilots:
         )
         score = PilotScore(
             steps=steps,
+            run_steps=self.config.steps,
             seed=seed,
             max_gaussians=max_gaussians,
             exposure=exposure,

@@ -32,7 +32,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.progress import Progress, TaskEvent, items_of_progress
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Scene, evenly_spaced
-from hyrfpack.train.checkpoint import names_and_sizes
+from hyrfpack.train.checkpoint import names_and_sizes, read_asked_steps
 from hyrfpack.train.decisions import chosen_steps, is_budget_open
 from hyrfpack.train.provenance import training_provenance
 from hyrfpack.train.trainer import Trainer
@@ -124,7 +124,8 @@ def changed_settings(record: TrainingRecord, scene: Scene, config: TrainConfig) 
         asked["budget_factor"] = record.settings.get("budget_factor")
     if config.exposure is None:
         asked["exposure"] = record.settings.get("exposure")
-    asked["steps"] = chosen_steps(scene, config, record.settings.get("steps"))
+    steps = record.settings.get("steps")
+    asked["steps"] = chosen_steps(scene, config, steps, read_asked_steps(record.metrics, steps))
     keys = asked.keys() | record.settings.keys()
     return sorted(key for key in keys if asked.get(key) != record.settings.get(key))
 

@@ -253,7 +253,7 @@ class _Run:
         saved = saved_decisions(self._checkpoint)
         factor = saved.budget_factor if is_budget_open(config) else config.budget_factor
         exposure = saved.exposure if config.exposure is None else config.exposure
-        steps = chosen_steps(self.scene, config, saved.steps)
+        steps = chosen_steps(self.scene, config, saved.steps, saved.asked_steps)
         return dataclasses.replace(config, budget_factor=factor, exposure=exposure, steps=steps)
 
     def _set_up(self, decisions: Decisions) -> Trainer:

@@ -54,6 +54,22 @@ def test_an_older_checkpoint_has_no_pilot_decisions(path):
     assert saved_decisions(path) == SavedDecisions(None, False, steps=40)
 
 
+@pytest.mark.parametrize(
+    ("run", "asked"),
+    [
+        ({"choices": {"exposure": "on"}, "pilots": []}, 40),
+        ({"choices": {"steps": "40: by pilots"}, "pilots": [{"run_steps": 90}]}, 90),
+        ({"choices": {"steps": "40: by pilots"}, "pilots": [{"steps": 40}]}, None),
+        ({"choices": {"steps": "40: by pilots"}, "pilots": [{"run_steps": "90"}]}, None),
+        ({"choices": {"steps": "40: by pilots"}, "pilots": [90]}, None),
+        ({"choices": 3, "pilots": 4}, None),
+    ],
+)
+def test_the_steps_that_the_user_asked_for_can_be_read_back(path, run, asked):
+    save_checkpoint(path, settings=STORED_SETTINGS, tensors={}, progress={**STORED_PROGRESS, **run})
+    assert saved_decisions(path).asked_steps == asked
+
+
 def test_an_invalid_exposure_decision_counts_as_damage(path):
     save_checkpoint(path, settings={**STORED_SETTINGS, "exposure": None}, tensors={}, progress=STORED_PROGRESS)
     with pytest.raises(HyrfTrainingError, match="damaged"):

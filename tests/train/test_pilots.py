@@ -25,6 +25,7 @@ from hyrfpack.progress import Event, StepEvent, TaskEvent
 from hyrfpack.scene import Camera, Scene, View
 from hyrfpack.train import TrainConfig, budget_pilots, decisions, exposure_pilots, length_pilots, pilots, train_model
 from hyrfpack.train.budget_pilots import BUDGET_FACTORS, measure_budget
+from hyrfpack.train.checkpoint import read_asked_steps
 from hyrfpack.train.decisions import (
     MIN_BUDGET_STEPS,
     MIN_EXPOSURE_STEPS,
@@ -635,3 +636,26 @@ def test_photos_from_one_or_two_places_are_split_like_others(places):
     apart = views_at(np.random.default_rng(0).normal(size=(12, 3)), 1)
     names = [[view.name for view in part] for part in pilots.split(views)]
     assert names == [[views[apart.index(view)].name for view in part] for part in pilots.split(apart)]
+
+
+@pytest.mark.usefixtures("signals")
+def test_an_interrupted_run_without_length_pilots_is_not_resumed_with_more_steps(tmp_path, monkeypatch):
+    config = TrainConfig(steps=8)
+    assert train_model(make_scene(), tmp_path, config, context=interrupt_at(4)).step == 4
+
+    monkeypatch.setattr(length_pilots, "MAX_UNMEASURED_STEPS", 10)
+    monkeypatch.setattr(length_pilots, "PILOT_LENGTHS_STEPS", (8,))
+    assert_resume_is_rejected(tmp_path, dataclasses.replace(config, steps=20))
+    assert train_model(make_scene(), tmp_path, config, resume=True, context=QUIET_CONTEXT).step == 8
+
+
+@pytest.mark.parametrize(("asked", "steps"), [(7_000, 1_000), (None, 1_000), (6_000, 7_000), (1_000, 7_000)])
+def test_a_shorter_length_counts_as_chosen_only_for_the_steps_that_were_asked_for(asked, steps):
+    assert decisions.chosen_steps(make_scene(), TrainConfig(steps=7_000), 1_000, asked) == steps
+
+
+def test_scores_of_length_pilots_state_the_steps_that_were_asked_for(scores):
+    scores |= {1000: 20.0, 3000: 19.8}
+    chosen, reason, runs = measure_scene_length(7_000)
+    run = {"choices": {"steps": reason}, "pilots": [dataclasses.asdict(score) for score in runs.scores]}
+    assert (chosen, read_asked_steps(run, chosen)) == (1_000, 7_000)

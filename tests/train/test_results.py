@@ -18,7 +18,7 @@ from hyrfpack.errors import HyrfDataError, HyrfError, HyrfTrainingError
 from hyrfpack.outputs import StrPath
 from hyrfpack.progress import Event, TaskEvent
 from hyrfpack.scene import Scene
-from hyrfpack.train import TrainConfig, Trainer, train_model
+from hyrfpack.train import TrainConfig, Trainer, length_pilots, train_model
 from hyrfpack.train import run as runs
 from hyrfpack.train.results import RECORD_FILE, TrainingRecord, read_record
 
@@ -205,6 +205,19 @@ def test_results_are_completed_with_the_settings_of_the_model_only(full_disk_suf
 
     train_model(make_scene(), tmp_path, other, overwrite=True, context=QUIET_CONTEXT)
     assert read_metrics(tmp_path)["settings"]["steps"] == 30 and file_names(tmp_path) == COMPLETE_RUN_FILES
+
+
+def test_results_of_a_run_without_length_pilots_are_not_completed_with_more_steps(
+    full_disk_suffixes, tmp_path, monkeypatch
+):
+    scene = ball_scene(views=10, points=60, side=24)
+    full_disk_suffixes.add("curve.png")
+    train_model(scene, tmp_path, TrainConfig(steps=8), context=QUIET_CONTEXT)
+    monkeypatch.setattr(length_pilots, "MAX_UNMEASURED_STEPS", 10)
+    monkeypatch.setattr(length_pilots, "PILOT_LENGTHS_STEPS", (8,))
+    for resume in (False, True):
+        with pytest.raises(HyrfTrainingError, match=r"other settings \(steps\)"):
+            train_model(scene, tmp_path, TrainConfig(steps=20), resume=resume, context=QUIET_CONTEXT)
 
 
 def test_metrics_of_an_earlier_model_do_not_stay_beside_a_new_one(full_disk_suffixes, tmp_path):
