@@ -12,7 +12,7 @@ import click
 from hyrfpack.outputs.names import ARCHIVE_SUFFIXES, READABLE_PICTURE_SUFFIXES, VIDEO_SUFFIXES
 from hyrfpack.splats.names import SPLATS_SUFFIXES
 
-_SIZE_PATTERN = re.compile(r"([0-9.]+)\s*([kmg]?)b?", re.IGNORECASE)
+_SIZE_PATTERN = re.compile(r"([0-9.]+|[0-9]{1,3}(?:,[0-9]{3})+)\s*([kmg]?)b?", re.IGNORECASE)
 
 
 class _InputPath(click.Path):
@@ -69,14 +69,15 @@ OUTPUT_FOLDER = _OutputFolder()
 
 
 class _Size(click.ParamType):
-    """Number of bytes, such as 2MB, 350k or 1500000; k, M and G are powers of 1000."""
+    """Number of bytes, such as 2MB, 350k, 1500000 or 1,500,000; k, M and G are powers of 1000."""
 
     name = "size"
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int:
         match = _SIZE_PATTERN.fullmatch(str(value).strip())
         try:
-            size = int(float(match[1]) * 1000 ** " kmg".index(match[2].lower() or " ")) if match else 0
+            number = float(match[1].replace(",", "")) if match else 0
+            size = int(number * 1000 ** " kmg".index(match[2].lower() or " ")) if match else 0
         except (ValueError, OverflowError):
             size = 0
         if size < 1:

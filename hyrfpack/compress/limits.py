@@ -66,7 +66,7 @@ def encode_within_bytes(
     if (smallest := len(candidate.data)) > limit:
         raise HyrfSizeError(
             f"the model does not fit into {limit:,} bytes: with the coarsest numbers it still takes {smallest:,} bytes",
-            fix="use a larger `target_bytes`, or train with fewer Gaussians (`max_gaussians`)",
+            fix=f"use a `target_bytes` of at least {smallest:,}, or train with fewer Gaussians (`max_gaussians`)",
             min_bytes=smallest,
         )
     return candidate, f"distortion {distortion:.2g} gives {len(candidate.data):,} of {limit:,} bytes"

@@ -22,7 +22,7 @@ from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError, named_in_errors
 from hyrfpack.format.codec import load_parts, load_with_provenance, packed_provenance, repack, write_model
 from hyrfpack.format.info import FileReport, describe_file
-from hyrfpack.format.min_file_size import check_target_bytes
+from hyrfpack.format.min_file_size import check_target_above, check_target_bytes, min_merged_file_bytes
 from hyrfpack.format.parts import write_merged
 from hyrfpack.format.run_folder import find_model
 from hyrfpack.out_of_memory import explain_out_of_memory
@@ -176,9 +176,11 @@ def _encode_merged(
 
 
 def _check_merged_target(source: Path, target_bytes: int) -> None:
-    """Raise HyrfError if no file of a part is as small as the target size of the merged file."""
-    for _, model, provenance in load_parts(source):
-        check_target_bytes(target_bytes, packed_provenance(provenance, model), model.exposure)
+    """Raise HyrfError if no merged file of the parts is as small as the target size."""
+    parts = [
+        (name, packed_provenance(provenance, model), model.exposure) for name, model, provenance in load_parts(source)
+    ]
+    check_target_above(target_bytes, min_merged_file_bytes(parts))
 
 
 def _encode_compact(

@@ -91,7 +91,7 @@ def write_edit(
         except HyrfSizeError as error:
             raise HyrfSizeError(
                 f"{edit.source}: after the edit {error.problem}",
-                fix="use a larger `target_bytes`, or keep fewer `gaussians`",
+                fix=f"use a `target_bytes` of at least {error.min_bytes:,}, or keep fewer `gaussians`",
                 min_bytes=error.min_bytes,
             ) from error
 

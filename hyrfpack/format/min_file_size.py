@@ -1,6 +1,8 @@
-"""Size of the smallest `.hyrf` file that packing can write, and the check of a target size against it."""
+"""Lower bound of the size of packed `.hyrf` files, and the check of a target size against it."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -11,7 +13,10 @@ from hyrfpack.format.compact.channels import Channel
 from hyrfpack.format.compact.groups import ENTROPY_MODEL_COUNT, GroupSymbols, StepGroups
 from hyrfpack.format.compact.plan import Layer, Plan, build_step_groups
 from hyrfpack.format.compact.quantized import LOGIT_COLUMNS, QuantizedModel
-from hyrfpack.format.sections import DECODER_SECTIONS, TABLE_SECTIONS
+from hyrfpack.format.container import Section, write_container
+from hyrfpack.format.part_names import CODEC_FILE, write_part_names
+from hyrfpack.format.sections import DECODER_SECTIONS, TABLE_SECTIONS, part_section
+from hyrfpack.format.versions import MERGED_MINOR_VERSION
 from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.quant.points import LatticePoints, encode_points
@@ -53,8 +58,21 @@ def min_file_bytes(provenance: dict | None = None, exposure: ExposureMap | None 
     return len(encode_model(model, "compact", provenance, quantized=QuantizedModel(plan, [channels], symbols)))
 
 
+def min_merged_file_bytes(parts: Sequence[tuple[str, dict | None, ExposureMap | None]]) -> int:
+    """Return the size in bytes of the smallest merged file that packing can write.
+
+    Args:
+        parts: name, provenance and exposure map of each part, see `min_file_bytes`.
+    """
+    sections = [write_part_names([name for name, _, _ in parts])]
+    for number, (_, provenance, exposure) in enumerate(parts):
+        part = bytes(min_file_bytes(provenance, exposure))
+        sections.append(Section(part_section(number), CODEC_FILE, part, len(part)))
+    return len(write_container(sections, minor=MERGED_MINOR_VERSION))
+
+
 def check_target_bytes(target_bytes: int, provenance: dict | None = None, exposure: ExposureMap | None = None) -> None:
-    """Raise an error if a target size is below the smallest possible file.
+    """Raise an error if a target size is below the smallest possible file, see `check_target_above`.
 
     Args:
         target_bytes: largest allowed size of the packed file, bytes.
@@ -62,15 +80,24 @@ def check_target_bytes(target_bytes: int, provenance: dict | None = None, exposu
         exposure: exposure map that the file will have, if known.
 
     Raises:
-        HyrfError: no packed file can be that small. The message suggests a unit if it seems to be missing.
+        HyrfError: no packed file can be that small.
     """
-    smallest = min_file_bytes(provenance, exposure)
+    check_target_above(target_bytes, min_file_bytes(provenance, exposure))
+
+
+def check_target_above(target_bytes: int, smallest: int) -> None:
+    """Raise an error if a target size is below a lower bound of the size of the file; both are in bytes.
+
+    Raises:
+        HyrfError: the size is below it. The message suggests a unit if it seems to be missing.
+    """
     if target_bytes >= smallest:
         return
     unit = (
         "MB" if target_bytes < MEGABYTE_HINT_BELOW_BYTES else "kB" if target_bytes < KILOBYTE_HINT_BELOW_BYTES else None
     )
-    remedy = f"did you mean {target_bytes}{unit}?" if unit else f"use a `target_bytes` of at least {smallest:,}"
+    bound = f"use a larger `target_bytes`; {smallest:,} is a lower bound, which only a model without Gaussians reaches"
+    remedy = f"did you mean {target_bytes}{unit}?" if unit else bound
     raise HyrfError(
         f"a target size of {target_bytes:,} bytes is below the smallest possible file, about {smallest:,} bytes",
         fix=remedy,

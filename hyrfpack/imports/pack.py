@@ -92,7 +92,11 @@ def pack(
         try:
             return packer.encode_within_bytes(target_bytes, distortion)[0].data
         except HyrfSizeError as cause:
-            raise HyrfSizeError(cause.problem, fix="use a larger `target_bytes`", min_bytes=cause.min_bytes) from cause
+            raise HyrfSizeError(
+                cause.problem,
+                fix=f"use a `target_bytes` of at least {cause.min_bytes:,}",
+                min_bytes=cause.min_bytes,
+            ) from cause
 
     def error_ratio(candidate: EncodedCandidate) -> float:
         """Return the larger ratio of an error to its limit: that of the mean, or that of the worst view."""

@@ -18,7 +18,7 @@ from PIL import Image
 
 from hyrfpack.cli import main
 from hyrfpack.cli.train import train
-from hyrfpack.cli.types import INPUT_PATH
+from hyrfpack.cli.types import INPUT_PATH, SIZE
 from hyrfpack.config.compress import PROFILES
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format import load_model
@@ -381,7 +381,15 @@ REJECTED_OPTIONS = {
     "a size of nothing": (("--target-size", "0.0001kB"), "is not a size"),
     "a negative size": (("--target-size", "-5kB"), "is not a size"),
     "two points": (("--target-size", "1.2.3MB"), "is not a size"),
+    "a decimal comma": (("--target-size", "1,84"), "is not a size"),
 }
+
+
+@pytest.mark.parametrize(
+    ("text", "size"), [("1,840", 1_840), ("12,345,678", 12_345_678), ("1,500 kB", 1_500_000), ("0.5MB", 500_000)]
+)
+def test_a_size_may_have_thousands_separators(text, size):
+    assert SIZE.convert(text, None, None) == size
 
 
 @pytest.mark.parametrize("case", REJECTED_OPTIONS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ from hyrfpack import compress_model
 from hyrfpack.cameras.capture import quantized_provenance
 from hyrfpack.compress.distortion import DISTORTION_RANGE
 from hyrfpack.config.compress import CompressConfig
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, HyrfSizeError
 from hyrfpack.format.codec import load_with_provenance
-from hyrfpack.format.min_file_size import check_target_bytes, min_file_bytes
+from hyrfpack.format.min_file_size import check_target_bytes, min_file_bytes, min_merged_file_bytes
+from hyrfpack.format.parts import encode_parts
 from hyrfpack.train import TrainConfig, train_model
 
 pytestmark = pytest.mark.integration
@@ -51,8 +53,9 @@ def test_a_target_below_the_bound_is_refused_with_a_hint_at_a_missing_unit(size,
     assert str(caught.value).endswith(remedy)
 
 
-def test_an_exact_target_below_the_bound_is_refused_without_a_hint(tiny_file_and_provenance):
-    with pytest.raises(HyrfError, match="of 1,000 bytes .*; use a `target_bytes` of at least "):
+def test_an_exact_target_below_the_bound_is_refused_with_the_bound(tiny_file_and_provenance):
+    message = r"of 1,000 bytes .*; use a larger `target_bytes`; \d,\d{3} is a lower bound"
+    with pytest.raises(HyrfError, match=message):
         check_target_bytes(1_000, tiny_file_and_provenance[1])
 
 
@@ -60,6 +63,28 @@ def test_a_target_at_the_bound_is_allowed():
     check_target_bytes(min_file_bytes())
     with pytest.raises(HyrfError):
         check_target_bytes(min_file_bytes() - 1)
+
+
+def test_the_bound_of_a_merged_file_is_that_of_its_parts_together(tiny_file_and_provenance, tmp_path):
+    packed, provenance = tiny_file_and_provenance
+    parts = [("scene", provenance, None), ("chair", provenance, None)]
+    merged = encode_parts([(name, packed.read_bytes()) for name, _, _ in parts])
+    bound = min_merged_file_bytes(parts)
+    assert len(merged) - bound == 2 * (packed.stat().st_size - min_file_bytes(provenance))
+    (tmp_path / "merged.hyrf").write_bytes(merged)
+    config = CompressConfig(target_bytes=bound - 1)
+    with pytest.raises(HyrfError, match=f"below the smallest possible file, about {bound:,} bytes"):
+        compress_model(tmp_path / "merged.hyrf", tmp_path / "out.hyrf", config, context=QUIET_CONTEXT)
+
+
+def test_a_file_of_the_size_that_the_message_names_can_be_packed(tiny_file_and_provenance, tmp_path):
+    source, target = tiny_file_and_provenance[0].with_name("model.hyrf"), tmp_path / "small.hyrf"
+    bound = min_file_bytes(tiny_file_and_provenance[1])
+    with pytest.raises(HyrfSizeError, match=r"use a `target_bytes` of at least [\d,]+, or") as caught:
+        compress_model(source, target, CompressConfig(target_bytes=bound), context=QUIET_CONTEXT)
+    named = int(re.search(r"at least ([\d,]+), or", caught.value.fix)[1].replace(",", ""))
+    report = compress_model(source, target, CompressConfig(target_bytes=named), context=QUIET_CONTEXT)
+    assert report.bytes_after <= named
 
 
 def test_training_for_an_impossible_file_size_is_refused_before_anything_is_written(tiny_file_and_provenance, tmp_path):

@@ -82,7 +82,7 @@ def test_an_import_stores_what_the_target_needs(tmp_path: Path, monkeypatch: pyt
     assert 0.9 * limit < filled.bytes_after <= limit and small.psnr < filled.psnr < large.psnr
     assert filled.psnr_asked is None
     least = min_file_bytes()
-    with pytest.raises(HyrfSizeError, match=f"does not fit into {least:,} bytes.*use a larger `target_bytes`"):
+    with pytest.raises(HyrfSizeError, match=f"does not fit into {least:,} bytes.*use a `target_bytes` of at least "):
         import_them(target_bytes=least)
     model, description = load_model(tmp_path / "x.hyrf"), describe_file(tmp_path / "x.hyrf")
     assert model.config.residual_degree == splats.degree and description["version"] == "1.6"
