@@ -94,6 +94,7 @@ class Container:
     Attributes:
         name: name of the file in error messages.
         length: bytes of the file, as the header declares.
+        stored: bytes of the file that exist; fewer than `length` if the file is truncated.
         available: bytes from the start of the file that exist and may be used.
         version: (major, minor) version of the format.
         entries: the whole table of contents by type, in file order, unknown optional sections included.
@@ -129,7 +130,7 @@ class Container:
             raise HyrfFormatError(f"{name}: the fraction {fraction} of a file is out of range", fix="use 0 to 1")
         self._read_at = read_at
         self.name = name
-        self.length = self.available = length
+        self.length = self.available = self.stored = length
         self._fraction = fraction
         self._known = known
         self._close: Callable[[], None] = lambda: None
@@ -218,6 +219,11 @@ class Container:
             if tag in self:
                 self[tag]
         return bytes(self._read_at(0, self.length))
+
+    @property
+    def fix_of_partial(self) -> str:
+        """Return what to do about a part of a file of which only the whole can be read."""
+        return "leave out `fraction`" if self.stored >= self.length else "copy the whole file again"
 
     def _is_available(self, entry: Entry) -> bool:
         return entry.end <= self.available

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -18,8 +18,10 @@ from hyrfpack.format.exposure import decode_exposure
 from hyrfpack.format.metadata import gaussian_limit, read_metadata
 from hyrfpack.format.sections import (
     EXPOSURE,
+    METADATA,
     PART_NAMES,
     POSITIONS,
+    SECTION_CONTENTS,
     TABLE_SECTIONS,
     group_and_layer,
     layer_section,
@@ -115,6 +117,8 @@ def read_layout(container: Container) -> ModelLayout:
         HyrfFormatError: a section is missing, has an unknown codec or another size than the metadata asks for, or there
             are more Gaussians than the size of the file allows.
     """
+    if METADATA in container.entries and METADATA not in container:
+        raise _incomplete_error(container, [tag for tag in container.entries if _is_in_first_layer(tag)])
     name, metadata, config = container.name, read_metadata(container), read_config(container)
     layers = metadata.layers or [metadata.gaussians]
     shapes, groups = {}, layered_groups(config)
@@ -129,18 +133,39 @@ def read_layout(container: Container) -> ModelLayout:
     layers = layers[:layer_count]
     shapes = {tag: shape for tag, shape in shapes.items() if group_and_layer(tag)[1] < layer_count}
     if any(tag not in container for tag in shapes) and container.available < container.length:
-        needed = max(container.entries[tag].end for tag in shapes)
-        raise HyrfFormatError(
-            f"{name}: the model needs the first {needed:,} of {container.length:,} bytes, but only "
-            f"{container.available:,} are available or allowed",
-            fix="read a larger part of the file",
-        )
+        raise _incomplete_error(container, shapes)
     if sum(layers) > (limit := gaussian_limit(container.available)):
         raise HyrfFormatError(
             f"{name}: the file claims {sum(layers):,} Gaussians, but its size allows at most {limit:,} Gaussians",
             fix="the file is damaged, copy or write it again",
         )
     return ModelLayout(config, layers, shapes)
+
+
+def _is_in_first_layer(tag: str) -> bool:
+    """Return whether the first layer of a model cannot be decoded without a section of this type."""
+    return tag in SECTION_CONTENTS and tag != EXPOSURE and group_and_layer(tag)[1] == 0
+
+
+def _incomplete_error(container: Container, tags: Iterable[str]) -> HyrfFormatError:
+    """Return the error for a partial file that ends before the last of the sections that decoding needs."""
+    length, needed = container.length, max(container.entries[tag].end for tag in tags)
+    if not any(group_and_layer(tag)[1] for tag in container.entries):
+        fix = f"the file has no layers, so that only the whole file can be read; {container.fix_of_partial}"
+    elif container.stored < needed:
+        fix = f"read a larger part of the file, at least its first {needed:,} bytes"
+    else:
+        fix = f"read a larger part of the file, with a `fraction` of at least {_min_fraction(needed, length):g}"
+    return HyrfFormatError(
+        f"{container.name}: the model needs the first {needed:,} of {length:,} bytes, but only "
+        f"{container.available:,} are available or allowed",
+        fix=fix,
+    )
+
+
+def _min_fraction(needed: int, length: int) -> float:
+    """Return the smallest fraction, in thousandths, of `length` bytes that holds the first `needed` bytes."""
+    return next(n / 1000 for n in range(needed * 1000 // length, 1001) if int(n / 1000 * length) >= needed)
 
 
 def _check_sections(container: Container, shapes: dict[str, tuple[int, int]]) -> None:

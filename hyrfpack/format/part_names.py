@@ -86,8 +86,14 @@ def open_parts(
 
     Raises:
         HyrfFormatError: a part is missing or damaged, is itself a merged file, the parts declare too many bytes or
-            Gaussians, or some of them are antialiased and others are not.
+            Gaussians, or some of them are antialiased and others are not; or only a part of the file is available.
     """
+    if container.available < container.length:
+        raise HyrfFormatError(
+            f"{container.name}: a merged file can only be read whole, but only {container.available:,} of its "
+            f"{container.length:,} bytes are available or allowed",
+            fix=container.fix_of_partial,
+        )
     parts = []
     for number, part_name in enumerate(read_part_names(container)):
         section = container[part_section(number)]

@@ -14,6 +14,7 @@ from hyrfpack.compress import plan
 from hyrfpack.format import describe_file, load_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.container import read_container
+from hyrfpack.format.parts import encode_parts
 from tools.safety.synthetic_encoding import encode
 
 STORED_PROVENANCE = {"preset": "standard"}
@@ -172,8 +173,29 @@ def test_too_little_of_a_file_is_a_clear_error_that_names_the_bytes_needed(
         assert f"{file_without_layers}: the model needs the first {needed:,} of {size:,} bytes" in refused(*arguments)
     for fraction in (0.0, 0.01, (needed - 1) / size):
         arguments = ("decompress", layered_file, "-o", tmp_path / "out.hyrf", "--fraction", fraction)
-        assert "read a larger part of the file" in refused(*arguments)
+        assert "read a larger part of the file, with a --fraction of at least " in refused(*arguments)
     assert not (tmp_path / "out").exists()
+
+
+def test_the_fraction_that_the_message_names_is_the_smallest_that_works(layered_file, tmp_path):
+    for fraction in (0.0, 0.01, 0.1):
+        sentence = refused("decompress", layered_file, "-o", tmp_path / "out.hyrf", "--fraction", fraction)
+        named = float(sentence.rpartition("at least ")[2])
+    assert 0.1 < named < 1
+    too_small = ("decompress", layered_file, "-o", tmp_path / "out.hyrf", "--fraction", named - 0.001)
+    assert refused(*too_small).endswith(f"at least {named:g}")
+    succeeded("decompress", layered_file, "-o", tmp_path / "out.hyrf", "--fraction", named)
+
+
+def test_a_part_of_a_merged_file_is_a_clear_error(layered_file, tmp_path):
+    data = encode_parts([("scene", layered_file.read_bytes()), ("chair", layered_file.read_bytes())])
+    merged, cut = tmp_path / "merged.hyrf", tmp_path / "cut.hyrf"
+    merged.write_bytes(data)
+    cut.write_bytes(data[:-8])
+    sentence = refused("decompress", merged, "-o", tmp_path / "out.hyrf", "--fraction", 0.5)
+    assert f"{merged}: a merged file can only be read whole" in sentence and sentence.endswith("leave out --fraction")
+    sentence = refused("render", cut, "-o", tmp_path / "out", "--orbit", 1, "--allow-partial")
+    assert f"{cut}: a merged file can only be read whole" in sentence and sentence.endswith("copy the whole file again")
 
 
 @pytest.mark.parametrize("profile", ["raw", "paper"])
@@ -185,9 +207,10 @@ def test_truncated_files_without_layers_are_rejected(profile, layered_file, data
 
     for arguments in reading_commands(part, data, tmp_path / "out", part=True):
         assert f"{part}: the model needs the first {size:,} of {size:,} bytes" in refused(*arguments)
-    assert "read a larger part of the file" in refused(
-        "decompress", full, "-o", tmp_path / "out.hyrf", "--fraction", 0.99
-    )
+        assert "has no layers" in refused(*arguments) and refused(*arguments).endswith("copy the whole file again")
+    for fraction in (0.0, 0.99):
+        sentence = refused("decompress", full, "-o", tmp_path / "out.hyrf", "--fraction", fraction)
+        assert sentence.endswith("has no layers, so that only the whole file can be read; leave out --fraction")
     assert not (tmp_path / "out").exists()
 
 

@@ -247,7 +247,7 @@ def test_sections_may_come_in_any_order():
     entries = read_container(data).entries
 
     assert_same_bits(decode_model(data), to_arrays(SAMPLE_MODEL))
-    with pytest.raises(HyrfFormatError, match="section 'META' ends at byte"):
+    with pytest.raises(HyrfFormatError, match=f"the model needs the first {len(data):,} of {len(data):,} bytes"):
         decode_model(data[: entries["META"].offset], fraction=1.0)
 
 
