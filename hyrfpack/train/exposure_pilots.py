@@ -91,7 +91,8 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
             gain, error = _mean_and_standard_error(gains)
             if abs(gain - limit) >= CLEAR_GAIN_STANDARD_ERRORS * error:
                 break
-    if len(gains) < MIN_EXPOSURE_VALIDATION_VIEWS:
+    is_loss = len(gains) > 1 and not is_large and np.mean(gains) <= 0
+    if len(gains) < MIN_EXPOSURE_VALIDATION_VIEWS and not is_loss:
         return False, f"masks leave {len(gains)} of the validation photos, too few to measure whether gains help"
     gain, error = _mean_and_standard_error(gains)
     needed = limit if is_large else max(limit, MIN_GAIN_STANDARD_ERRORS * error)

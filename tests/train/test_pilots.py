@@ -394,6 +394,15 @@ def test_too_few_unmasked_validation_photos_decide_nothing(scores, monkeypatch, 
     assert decision is False and reason.startswith(f"masks leave {left} of the validation photos, too few")
 
 
+def test_a_loss_that_ends_the_rounds_early_is_the_reason_also_of_few_validation_photos(scores, monkeypatch):
+    monkeypatch.setattr(exposure_pilots, "estimate_exposure_spread", lambda *_: 0.1)
+    scores |= {False: [20.0] * 2, True: [19.9] * 2, "apart": (0.0,) * 2}
+    runs = ScenePilots(make_scene(8), LONG_CONFIG, PictureCache(), CPU_DEVICE)
+    decision, reason = measure_exposure(runs)
+    assert decision is False and len(runs.scores) == 2
+    assert "scored -0.10 dB of plain PSNR" in reason and "on 2 validation photos" in reason
+
+
 @pytest.mark.parametrize(("side", "trained_side"), [(127, 127), (128, 64), (131, 65)])
 def test_exposure_pilots_train_on_photos_of_half_the_size_and_a_quarter_of_the_gaussians(
     scores, monkeypatch, side, trained_side
