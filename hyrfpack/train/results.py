@@ -29,8 +29,10 @@ from hyrfpack.evaluate.figures import draw_training_curve
 from hyrfpack.format.codec import write_model
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.model import HybridModel
+from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent, items_of_progress
 from hyrfpack.render import RenderSettings, render_view
+from hyrfpack.render.files import unique_stems
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train.checkpoint import names_and_sizes, read_asked_steps
 from hyrfpack.train.decisions import chosen_steps, is_budget_open
@@ -197,7 +199,7 @@ def save_model(trainer: Trainer, out: Path, progress: Progress, *, overwrite: bo
             write_atomic(out / RECORD_FILE, record.encode())
     if overwrite:
         # Results of an earlier run would be mistaken for those of this model.
-        for result in (METRICS_FILE, CURVE_FILE, *_picture_files(scene)):
+        for result in (*_earlier_pictures(out, scene), METRICS_FILE, CURVE_FILE, *_picture_files(scene)):
             remove_if_possible(out / result)
     if is_recorded and (overwrite or trainer.saved is not None):
         remove_if_possible(out / CHECKPOINT_FILE)  # This also frees space for the results.
@@ -290,6 +292,23 @@ def _settings_of(scene: Scene, config: TrainConfig) -> dict[str, Any]:
 def _picture_files(scene: Scene) -> list[str]:
     """Return the paths of the pictures of held-out views, relative to the run's folder."""
     return [f"{VIEWS_FOLDER}/{name}" for name in picture_names(scene.test).values()]
+
+
+def _earlier_pictures(out: Path, scene: Scene) -> list[str]:
+    """Return the paths of the pictures of an earlier run that its `metrics.json` lists, relative to the run's folder.
+
+    That file may be damaged or hostile. So there are none if one of them is a photo of the scene, and none outside of
+    the folder of pictures.
+    """
+    try:
+        scores = json.loads((out / METRICS_FILE).read_bytes())["evaluation"]
+        names = [*(view["name"] for view in scores["views"]), *scores["skipped"]]
+        pictures = [f"{VIEWS_FOLDER}/{name}.png" for name in unique_stems(names)]
+        Outputs(scene=scene, overwrite=True).folder(out, pictures)
+        folder = out.resolve() / VIEWS_FOLDER
+        return [picture for picture in pictures if (out / picture).parent.resolve().is_relative_to(folder)]
+    except (HyrfError, OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return []
 
 
 def remove_if_possible(path: Path) -> None:

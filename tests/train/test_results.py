@@ -220,6 +220,38 @@ def test_results_of_a_run_without_length_pilots_are_not_completed_with_more_step
             train_model(scene, tmp_path, TrainConfig(steps=20), resume=resume, context=QUIET_CONTEXT)
 
 
+def test_pictures_of_an_earlier_run_do_not_stay_beside_those_of_other_held_out_photos(tmp_path):
+    scene = make_scene()
+    train_model(scene, tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
+    earlier = file_names(tmp_path / "views")
+    (tmp_path / "views" / "notes.png").write_bytes(b"of the user")
+    other = dataclasses.replace(scene, train=scene.train[2:] + scene.test, test=scene.train[:2])
+    train_model(other, tmp_path, SHORT_CONFIG, overwrite=True, context=QUIET_CONTEXT)
+    left = file_names(tmp_path / "views")
+    assert "notes.png" in left and len(left) == 3 and not earlier & left
+
+
+@pytest.mark.parametrize(
+    "listed",
+    [
+        {"views": [{"name": "../../outside.png"}], "skipped": ["/outside.png"]},
+        {"views": [{"name": "linked/outside.png"}], "skipped": []},
+        {"views": [{"name": 3}], "skipped": []},
+        {"views": [7], "skipped": None},
+        [],
+    ],
+)
+def test_a_hostile_list_of_earlier_pictures_removes_nothing_outside(tmp_path, listed):
+    outside = tmp_path / "outside.png"
+    outside.write_bytes(b"kept")
+    out = tmp_path / "run"
+    (out / "views").mkdir(parents=True)
+    (out / "views" / "linked").symlink_to(tmp_path)
+    (out / "metrics.json").write_text(json.dumps({"evaluation": listed}))
+    train_model(make_scene(), out, SHORT_CONFIG, overwrite=True, context=QUIET_CONTEXT)
+    assert outside.read_bytes() == b"kept" and "evaluation" in read_metrics(out)
+
+
 def test_metrics_of_an_earlier_model_do_not_stay_beside_a_new_one(full_disk_suffixes, tmp_path):
     train_model(make_scene(), tmp_path, SHORT_CONFIG, context=QUIET_CONTEXT)
     full_disk_suffixes |= {"metrics.json", ".png"}
