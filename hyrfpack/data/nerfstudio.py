@@ -107,7 +107,8 @@ def _listed_split(content: dict[str, Any], file: Path) -> tuple[set | None, set,
     """Read the file's own split.
 
     Returns:
-        Listed paths to keep (None for all), the held-out ones among them, and a note if only one side is listed.
+        Listed paths to keep (None for all), the held-out ones among them, and a note if only one side is listed or if
+        photos are in neither.
     """
     lists = {}
     for key in ("train_filenames", "val_filenames", "test_filenames"):
@@ -121,7 +122,14 @@ def _listed_split(content: dict[str, Any], file: Path) -> tuple[set | None, set,
         listed = [key for key, names in lists.items() if names]
         note = f"{file.name} lists {' and '.join(listed)} alone, which is half a split and is not used"
         return None, set(), [note] if listed else []
-    return train | held_out, held_out, []
+    keep, frames = train | held_out, content["frames"]
+    unused = sum(PurePosixPath(frame["file_path"]) not in keep for frame in frames)
+    held_out_key = "test_filenames" if test else "val_filenames"
+    note = (
+        f"{unused} of {len(frames)} photos are not used: they are neither in train_filenames nor in {held_out_key} of "
+        f"{file.name}"
+    )
+    return keep, held_out, [note] if unused else []
 
 
 def _common_folder(listed: list[str]) -> PurePosixPath:

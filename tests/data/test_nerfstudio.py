@@ -130,6 +130,14 @@ def test_the_split_of_the_set_is_used_and_unlisted_photos_are_dropped(nerfstudio
 
     assert [view.name for view in scene.train] == ["001.png", "004.png"]
     assert [view.name for view in scene.test] == ["003.png"]
+    note = "2 of 5 photos are not used: they are neither in train_filenames nor in test_filenames of transforms.json"
+    assert note in scene.notes
+
+
+def test_a_split_of_all_photos_has_no_note(nerfstudio_folder):
+    names = [f"images/{number:03d}.png" for number in range(5)]
+    scene = load_scene(nerfstudio_folder(5, train_filenames=names[:4], val_filenames=names[4:]))
+    assert len(scene.train) == 4 and not any("not used" in note for note in scene.notes)
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])
