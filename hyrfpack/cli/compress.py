@@ -126,15 +126,18 @@ def compress(
             return
         scores = _score_both_files(model, Path(result.file), scene, part_of_progress(progress, 0.9, 1.0))
     written = note_rename(output, result.file)
+    page = None
     if report is not None:
         from hyrfpack.report.compression import write_compression_report
 
         command = _command_as_typed(click.get_current_context())
-        write_compression_report(report, model, written, result, scene, command=command, overwrite=overwrite)
+        page = write_compression_report(report, model, written, result, scene, command=command, overwrite=overwrite)
     if as_json:
-        print_json({**result.to_dict(), **scores})
-    else:
-        _print_compression(result, scores)
+        print_json({**result.to_dict(), **scores, **({} if page is None else {"report": str(page)})})
+        return
+    _print_compression(result, scores)
+    if page is not None:
+        click.echo(f"{page}: rate and distortion, renders, error maps; open it in a browser")
 
 
 @click.command(short_help="Decompress a file to exact float32.")

@@ -316,7 +316,16 @@ def test_the_command_line_writes_the_page_and_reports_it(model_file, tmp_path):
         "compress", model_file, "-o", tmp_path / "p.hyrf", "--profile", "raw", "--report", tmp_path / "page"
     )
     assert "for the report" in result.stderr
-    assert ParsedReport(tmp_path / "page" / "index.html").texts["pre"][0].startswith("hyrfpack ")
+    page = tmp_path / "page" / "index.html"
+    assert result.stdout.splitlines()[-1].startswith(f"{page}: ")
+    assert ParsedReport(page).texts["pre"][0].startswith("hyrfpack ")
+
+
+def test_the_json_report_of_a_command_names_the_page(model_file, tmp_path):
+    arguments = ("compress", model_file, "--profile", "raw", "--json")
+    result = succeeded(*arguments, "-o", tmp_path / "p.hyrf", "--report", tmp_path / "page")
+    assert json.loads(result.stdout)["report"] == str(tmp_path / "page" / "index.html")
+    assert "report" not in json.loads(succeeded(*arguments, "-o", tmp_path / "q.hyrf").stdout)
 
 
 @pytest.mark.parametrize(
