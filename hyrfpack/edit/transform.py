@@ -22,6 +22,8 @@ from hyrfpack.scene import MAX_WORLD_COORDINATE, Camera, View
 CAMERA_KEYS = ("cameras", "coarse_cameras")
 # A scene whose frame is turned by less has been turned back, and gets the file of one that was never turned.
 MIN_TURN_RADIANS = 1e-12
+# Poses and centres are float64, which at this multiple of a scene's half size still hold a ten-thousandth of it.
+MAX_DISTANCE_RATIO = 1e12
 MIN_FRAME_SCALE = 1e-30  # sizes are float32 in files and pictures, see MAX_WORLD_COORDINATE
 
 
@@ -97,7 +99,7 @@ class Placement:
         """Return the frame of a moved model.
 
         Raises:
-            HyrfError: float32 cannot hold the moved scene, as it is too far away, too large or too small.
+            HyrfError: the moved scene is too far away, too large or too small for the numbers that hold it.
         """
         x, y, z = self.move_point(frame.center).tolist()
         scale = self.factor * frame.scale
@@ -107,6 +109,12 @@ class Placement:
                 f"moves take the scene's centre to ({x:g}, {y:g}, {z:g}) and its half size to {scale:g}; sizes of at "
                 f"least {MIN_FRAME_SCALE:g} and coordinates of at most {MAX_WORLD_COORDINATE:g} are possible",
                 fix="move and scale it by less",
+            )
+        if reach > MAX_DISTANCE_RATIO * scale:
+            raise HyrfError(
+                f"moves take the scene's centre to ({x:g}, {y:g}, {z:g}), {reach / scale:.2g} times its half size off; "
+                f"up to {MAX_DISTANCE_RATIO:g} times, numbers are fine enough to keep its shape",
+                fix="move it by less",
             )
         w, i, j, k = (quaternion_from_matrix(self.rotation @ frame.axes) + 0.0).tolist()  # + 0.0 turns -0.0 into 0.0
         rotation = IDENTITY if 2 * math.hypot(i, j, k) < MIN_TURN_RADIANS else (w, i, j, k)

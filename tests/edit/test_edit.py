@@ -414,6 +414,7 @@ def test_an_edit_that_leaves_nothing_is_refused_and_writes_nothing(tmp_path):
         (["--plan", "--scale", "1e300"], "coordinates of at most 1e+30 are possible; move and scale it by less"),
         (["--plan", "--scale", "1e-300"], "sizes of at least 1e-30"),
         (["--plan", "--translate", "0,-1e300,0"], "-1e+300"),
+        (["--plan", "--translate", "0,-1e20,0"], "times, numbers are fine enough to keep its shape; move it by less"),
         (["--center"], "give either -o FILE"),
         (["--plan", "--center", "--profile", "raw"], "leave out --profile"),
         (["--plan", "-o", "out.hyrf", "--center"], "give either -o FILE"),
