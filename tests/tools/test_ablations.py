@@ -11,6 +11,7 @@ import torch
 from scenes import ball_scene, ring, small_model
 
 from hyrfpack.data import PictureCache
+from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.model.hash_grid import HashGrid
 from hyrfpack.render import render_view
@@ -109,6 +110,17 @@ def test_without_logits_gaussians_start_at_the_mean_of_the_initial_logits(name):
     torch.testing.assert_close(colors.logit().mean(0), expected_colors.logit().mean(0), atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("name", [name for name in VARIANTS_BY_NAME if VARIANTS_BY_NAME[name].model is not HybridModel])
+def test_gaussians_of_another_model_start_with_the_same_colours_and_backgrounds(name):
+    full, model = make_trainer("full").model, make_trainer(name).model
+    start = full.radiance.biases[-1]
+    assert start.any() and torch.equal(model.radiance.biases[-1][:3], start)
+    expected = torch.sigmoid(full.gaussians.color_logits + start)
+    # The untrained field of the single-field variant adds random logits.
+    noise = 0.2 if name == "single field" else 1e-5
+    torch.testing.assert_close(decode(model)[3], expected, atol=noise, rtol=0)
+
+
 def test_the_full_variant_trains_the_same_model_as_the_default_trainer():
     product, ours = Trainer(make_scene(), SHORT_CONFIG), make_trainer("full")
     product.run()
@@ -170,9 +182,10 @@ def test_harmonic_colours_start_as_the_point_colours_in_all_directions():
     full, model = make_trainer("full").model, make_trainer("spherical harmonics for colour").model
 
     assert model.gaussians.color_logits.shape == (len(model), 48)
+    expected = torch.sigmoid(full.gaussians.color_logits + full.radiance.biases[-1])
     for viewpoint in ring(3):
         colors = model.decode_colors(torch.from_numpy(viewpoint.position).float())
-        torch.testing.assert_close(colors, torch.sigmoid(full.gaussians.color_logits), atol=1e-6, rtol=0)
+        torch.testing.assert_close(colors, expected, atol=1e-6, rtol=0)
 
 
 def test_harmonic_colours_match_the_formula_of_3dgs():

@@ -21,7 +21,7 @@ def run_tool(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(long_runs, "load_variant", lambda data, name: scene)
 
     def run(*options: str) -> str:
-        arguments = ["long_runs", "--steps", "20", "10", "--sets", "ball", "--out", str(tmp_path), *options]
+        arguments = ["long_runs", "--steps", "40", "20", "--sets", "ball", "--out", str(tmp_path), *options]
         monkeypatch.setattr("sys.argv", arguments)
         long_runs.main()
         return capsys.readouterr().out
@@ -32,9 +32,9 @@ def run_tool(monkeypatch, tmp_path, capsys):
 def test_the_queue_trains_short_runs_first_and_each_run_once(run_tool, tmp_path):
     first = run_tool()
     trained = [line.rsplit("/", 3)[1] for line in first.splitlines() if " to " in line]
-    assert trained == ["10", "20"]
+    assert trained == ["20", "40"]
 
-    path = tmp_path / "10/seed0/ball/measured.json"
+    path = tmp_path / "20/seed0/ball/measured.json"
     row = json.loads(path.read_text())
     assert row["compact"]["bytes"] == (path.parent / "compact.hyrf").stat().st_size
     assert row["compact"]["psnr"] == pytest.approx(row["psnr"], abs=1)
@@ -43,10 +43,10 @@ def test_the_queue_trains_short_runs_first_and_each_run_once(run_tool, tmp_path)
 
 
 def test_a_run_that_another_call_trains_is_skipped(run_tool, tmp_path):
-    with exclusive_folder(tmp_path / "10/seed0/ball.queue"):
+    with exclusive_folder(tmp_path / "20/seed0/ball.queue"):
         printed = run_tool()
-    assert not (tmp_path / "10/seed0/ball").exists()
-    assert (tmp_path / "20/seed0/ball/measured.json").exists()
+    assert not (tmp_path / "20/seed0/ball").exists()
+    assert (tmp_path / "40/seed0/ball/measured.json").exists()
     assert "another" in printed
 
 
@@ -80,7 +80,7 @@ def test_a_finished_run_gets_the_fine_tuned_file_that_is_asked_for(run_tool, tmp
     row = {"name": "ball", "seed": 0, "exposure": None, "gains": False, "gaussians": 9, "seconds": 1.0}
     row |= {name: 20.0 for name in ("psnr", "ssim", "training_psnr")}
     row |= {profile: {"bytes": 1, "psnr": 20.0, "ssim": 0.5} for profile in ("raw", "paper", "compact")}
-    for steps in (10, 20):
+    for steps in (20, 40):
         folder = tmp_path / f"{steps}/seed0/ball"
         folder.mkdir(parents=True)
         (folder / "measured.json").write_text(json.dumps(row | {"steps": steps, "steps_taken": steps}))

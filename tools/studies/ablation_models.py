@@ -221,8 +221,7 @@ def build_trainer(scene: Scene, config: TrainConfig, variant: Variant, cache: Pi
     """Return hyrfpack's trainer with a variant's model and optimiser."""
     trainer = Trainer(scene, replace(config, **variant.changes), cache)
     if variant.model is not HybridModel:
-        product = trainer.model
-        trainer.model = variant.model(product.config, product.gaussians, torch.Generator().manual_seed(config.seed))
+        trainer.model = _replace_model(trainer.model, variant.model, config.seed)
     for name in variant.missing_logits:
         _start_from_mean(trainer.model, name)
     trainer.optimizer = OptimizerWithoutLogits(trainer.model, trainer.learning_rates, variant.missing_logits)
@@ -230,8 +229,23 @@ def build_trainer(scene: Scene, config: TrainConfig, variant: Variant, cache: Pi
 
 
 @torch.no_grad()
+def _replace_model(model: HybridModel, kind: type[HybridModel], seed: int) -> HybridModel:
+    """Return an untrained model of another kind with the same Gaussians, which start with the same colours.
+
+    The radiance field starts at the median colour of the photos. It colours the background sphere in all kinds of
+    models, and Gaussians only in a SingleField.
+    """
+    start = model.radiance.biases[-1].detach()
+    if kind is not SingleField:
+        model.gaussians.color_logits.add_(start)
+    other = kind(model.config, model.gaussians, torch.Generator().manual_seed(seed))
+    other.radiance.biases[-1][: len(start)] = start
+    return other
+
+
+@torch.no_grad()
 def _start_from_mean(model: HybridModel, name: str) -> None:
-    """Initialise the field's output bias with the mean of the explicit logits that the variant lacks."""
+    """Add the mean of the explicit logits that the variant lacks to the field's output bias."""
     geometry, radiance = model.geometry.biases[-1], model.radiance.biases[-1]
     bias = {"opacity_logits": geometry[:1], "scale_logits": geometry[1:4], "color_logits": radiance}[name]
-    bias.copy_(getattr(model.gaussians, name).mean(0).expand_as(bias))
+    bias.add_(getattr(model.gaussians, name).mean(0).expand_as(bias))
