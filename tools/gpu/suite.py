@@ -30,7 +30,14 @@ _TEST_LINES = (
     re.compile(rf"(?P<file>\S+\.py)::.* {_OUTCOME}(?: \(.*\))?\s+\[ *\d+%\]\s*"),
     re.compile(rf"\[gw\d+\] \[ *\d+%\] {_OUTCOME} (?P<file>\S+\.py)::.*\s*"),
 )
-_OUTCOME_LABELS = {"PASSED": "passed", "FAILED": "failed", "ERROR": "errors", "SKIPPED": "skipped", "XFAIL": "xfailed"}
+_OUTCOME_LABELS = {
+    "PASSED": "passed",
+    "FAILED": "failed",
+    "ERROR": "errors",
+    "SKIPPED": "skipped",
+    "XFAIL": "xfailed",
+    "XPASS": "xpassed",
+}
 _FAILED_OUTCOMES = ("FAILED", "ERROR")
 
 
@@ -91,5 +98,5 @@ def _has_failed(outcomes: Counter[str]) -> bool:
 def _row(file: str, outcomes: Counter[str]) -> Row:
     return {
         "case": file,
-        "result": ", ".join(f"{count} {_OUTCOME_LABELS.get(name, name)}" for name, count in outcomes.items()),
+        "result": ", ".join(f"{outcomes[name]} {label}" for name, label in _OUTCOME_LABELS.items() if outcomes[name]),
     }
