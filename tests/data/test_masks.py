@@ -14,7 +14,7 @@ from hyrfpack.data.pictures import read_mask
 from hyrfpack.errors import HyrfDataError
 
 # EXIF orientation -> the stored array of an upright one
-STORED = {
+STORED_PIXELS_BY_ORIENTATION = {
     1: lambda upright: upright,
     2: lambda upright: upright[:, ::-1],
     3: lambda upright: upright[::-1, ::-1],
@@ -30,7 +30,7 @@ def save_stored(path: Path, upright: np.ndarray, orientation: int, exif_orientat
     path.parent.mkdir(exist_ok=True)
     exif = Image.Exif()
     exif[0x0112] = exif_orientation
-    Image.fromarray(np.ascontiguousarray(STORED[orientation](upright))).save(path, exif=exif)
+    Image.fromarray(np.ascontiguousarray(STORED_PIXELS_BY_ORIENTATION[orientation](upright))).save(path, exif=exif)
 
 
 def write_turned_set(root: Path, orientations: list[int], masks_are_stored: bool, mask_scale: int = 1) -> None:
