@@ -1,4 +1,4 @@
-"""Start the radiance field of an untrained model at the median colour of the photos.
+"""Start the radiance field of an untrained model at the median colour of photos that are mostly dark or bright.
 
 The field colours the background sphere and all Gaussians together. An untrained field has logits near 0, which is grey.
 On photos that are mostly black or white, the first steps would move all colours alike, by far more than needed, to
@@ -20,7 +20,19 @@ from hyrfpack.scene import Picture, Scene, evenly_spaced
 
 MAX_PHOTOS = 24
 MAX_PHOTO_PIXELS = 1 << 16  # Of a larger photo, rows and columns are left out.
+# Where all channels have a median in this range, fields start at grey.
+MIN_USUAL_MEDIAN, MAX_USUAL_MEDIAN = 0.15, 0.85
 MIN_COVERAGE = 128  # Without a background sphere, the fields colour what alpha covers.
+
+
+def first_color(scene: Scene, cache: PictureCache, solid: np.ndarray | None) -> np.ndarray:
+    """Return the colour (3,) at which the field starts: the median, or grey if it is of usual brightness.
+
+    Arguments and errors are those of `median_color`.
+    """
+    color = median_color(scene, cache, solid)
+    is_usual = (color >= MIN_USUAL_MEDIAN).all() and (color <= MAX_USUAL_MEDIAN).all()
+    return np.full(3, 0.5) if is_usual else color
 
 
 def median_color(scene: Scene, cache: PictureCache, solid: np.ndarray | None) -> np.ndarray:

@@ -23,7 +23,7 @@ from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
 from hyrfpack.scene import Scene
-from hyrfpack.train.median_color import median_color, start_fields_at
+from hyrfpack.train.median_color import first_color, start_fields_at
 from hyrfpack.train.provenance import training_provenance
 from hyrfpack.train.silhouette import inside_silhouettes
 from hyrfpack.train.surface_points import draw_surface_points
@@ -199,7 +199,7 @@ def build_model(
         antialiased=config.antialiased,
     )
     cache = cache or PictureCache(0)
-    color = median_color(scene, cache, np.array(model_config.solid, np.float32) if background else None)
+    color = first_color(scene, cache, np.array(model_config.solid, np.float32) if background else None)
     pictures = cache if config.surface_points else None
     points, colors, source = initial_points(scene, frame, budget, config.seed, pictures)
     model = HybridModel(model_config, _gaussians(points, colors, model_config), _generator(config.seed))

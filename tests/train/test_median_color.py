@@ -14,7 +14,7 @@ from hyrfpack.evaluate import evaluate_model
 from hyrfpack.render import render_view
 from hyrfpack.scene import Picture, Scene
 from hyrfpack.train import TrainConfig, Trainer
-from hyrfpack.train.median_color import MAX_PHOTO_PIXELS, median_color, start_fields_at
+from hyrfpack.train.median_color import MAX_PHOTO_PIXELS, first_color, median_color, start_fields_at
 
 
 def scene_of(*pictures: Picture) -> Scene:
@@ -57,6 +57,12 @@ def test_large_photos_are_reduced():
     assert rgb.shape[0] * rgb.shape[1] > MAX_PHOTO_PIXELS
     rgb[:, :401] = 50
     np.testing.assert_allclose(median_of(Picture(rgb)), [50] * 3)
+
+
+@pytest.mark.parametrize(("level", "first"), [(0, 0.5), (30, 30), (60, 127.5), (200, 127.5), (230, 230), (255, 254.5)])
+def test_fields_start_at_the_median_of_dark_and_bright_photos_alone(level, first):
+    scene = scene_of(Picture(np.full((2, 2, 3), level, np.uint8)))
+    np.testing.assert_allclose(255 * first_color(scene, PictureCache(), None), [first] * 3)
 
 
 @pytest.mark.parametrize("background", [False, True])
