@@ -22,7 +22,7 @@ MAX_PHOTOS = 24
 MAX_PHOTO_PIXELS = 1 << 16  # Of a larger photo, rows and columns are left out.
 # Where all channels have a median in this range, fields start at grey.
 MIN_USUAL_MEDIAN, MAX_USUAL_MEDIAN = 0.15, 0.85
-MIN_COVERAGE = 128  # Without a background sphere, the fields colour what alpha covers.
+MIN_COVERED_ALPHA = 128  # Without a background sphere, the fields colour the pixels of at least this 8-bit alpha.
 
 
 def first_color(scene: Scene, cache: PictureCache, solid: np.ndarray | None) -> np.ndarray:
@@ -83,7 +83,7 @@ def _levels(picture: Picture, solid: np.ndarray | None) -> np.ndarray:
     assert rgb is not None
     is_used = np.ones(rgb.shape[:2], bool) if mask is None else mask
     if alpha is not None and solid is None:
-        is_used = is_used & (alpha >= MIN_COVERAGE)
+        is_used = is_used & (alpha >= MIN_COVERED_ALPHA)
     elif alpha is not None:
         rgb = (Picture(rgb, alpha).composite(solid) * 255 + 0.5).astype(np.uint8)
     return rgb[is_used]

@@ -232,7 +232,7 @@ def build_trainer(scene: Scene, config: TrainConfig, variant: Variant, cache: Pi
 def _replace_model(model: HybridModel, kind: type[HybridModel], seed: int) -> HybridModel:
     """Return an untrained model of another kind with the same Gaussians, which start with the same colours.
 
-    The radiance field starts at the median colour of the photos. It colours the background sphere in all kinds of
+    The radiance field starts at the colour that `build_model` chose. It colours the background sphere in all kinds of
     models, and Gaussians only in a SingleField.
     """
     start = model.radiance.biases[-1].detach()
