@@ -8,6 +8,7 @@ sentence on standard error). No module here imports torch or numpy before a comm
 from __future__ import annotations
 
 import errno
+import os
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
@@ -49,6 +50,9 @@ from hyrfpack.errors import HyrfError, needs_package, printable
 from hyrfpack.kernel_errors import KERNEL_ERROR_FIX, describe_kernel_error
 from hyrfpack.out_of_memory import describe_out_of_memory
 from hyrfpack.version import __version__
+
+# Errors of the system at any path of a user, such as one in a folder without access.
+_PATH_ERRORS = (errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.EIO)
 
 
 class _CommandGroup(click.Group):
@@ -103,6 +107,8 @@ def _explain_error(error: Exception) -> str | None:
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         # Functions that write files raise HyrfError, so that this error comes from printing onto a full disk.
         return f"the output cannot be printed ({error.strerror}); send it elsewhere"
+    if isinstance(error, OSError) and error.filename is not None and error.errno in _PATH_ERRORS:
+        return f"{printable(os.fsdecode(error.filename))}: cannot be used ({error.strerror}); check the path"
     return None
 
 

@@ -133,6 +133,17 @@ def downscale_factor(name: str) -> int:
     return int(match[1]) if match else 0
 
 
+def why_missing(path: Path, kind: str) -> str | None:
+    """Return why nothing can be read at a path: there is "no such" file or folder, or access is denied; or None."""
+    try:
+        os.stat(path)
+    except PermissionError as error:
+        return f"cannot be read ({error.strerror})"
+    except (OSError, ValueError):  # also for names that are too long or have zeros
+        return f"no such {kind}"
+    return None
+
+
 def _list_files(root: Path, is_wanted: Callable[[str], bool], photos_only: bool) -> list[Path]:
     """List the files below a folder whose names `is_wanted` accepts, sorted by their relative paths."""
     if not os.path.isdir(root):  # Path.is_dir raises if a name is too long

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hyrfpack.data import load_scene
 from hyrfpack.data.archive import is_archive, unpack
-from hyrfpack.data.folder import list_photos
+from hyrfpack.data.folder import list_photos, why_missing
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
 from hyrfpack.make.held_out import choose_inner_view
 from hyrfpack.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs, StrPath
@@ -71,8 +71,8 @@ class Source:
             HyrfDataError: no scene can be made from it.
         """
         path = Path(path)
-        if not os.path.lexists(path):
-            raise HyrfDataError(f"{path}: no such file or folder", fix="check the path")
+        if (why := why_missing(path, "file or folder")) is not None:
+            raise HyrfDataError(f"{path}: {why}", fix="check the path")
         ending = path.suffix.lower()
         if path.is_file() and (ending == ".hyrf" or is_splats(path)):
             return cls(path, "model" if ending == ".hyrf" else "splats")
