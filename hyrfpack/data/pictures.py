@@ -143,6 +143,8 @@ def open_picture(path: Path) -> ImageFile:
             raise HyrfDataError(f"{shown}: the picture file is empty (0 bytes)", fix="copy it again")
         _register_heic(path)
         image = Image.open(path)
+        if image.format == "TIFF":  # Pillow would map turned files into memory with width and height exchanged
+            image.filename = ""
         if image.format == "EPS":  # PostScript is a program, and Pillow would run it with Ghostscript
             image.close()
             raise HyrfDataError(f"{shown}: PostScript is not a photo", fix="save it as PNG or JPEG")
@@ -271,8 +273,6 @@ def read_pixels(
                 else image.draft(None, (_MIN_DRAFT_SIZE_RATIO * stored[0], _MIN_DRAFT_SIZE_RATIO * stored[1]))
             )
             applied = _orientation_applied_by_pillow(image)
-            if applied >= 5:
-                image.filename = ""  # otherwise Pillow maps the file into memory with width and height exchanged
             if image.mode in _SIXTEEN_BIT_MODES:
                 values = np.asarray(image).astype(np.float64)
                 levels = np.where(values != 0, 255, 0) if as_mask else np.clip(values, 0, 65535) / 257 + 0.5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections.abc import Collection
@@ -16,7 +17,9 @@ REPORT_NAME = "poses.json"
 MODEL_FILES = frozenset(f"sparse/0/{table}.bin" for table in ("cameras", "frames", "images", "points3D", "rigs"))
 IGNORED_NAMES = frozenset((".DS_Store", "Thumbs.db", "desktop.ini"))  # File managers write these into any folder.
 
-OwnedFiles = dict[str, int]  # size in bytes of each file, by its path relative to the scene
+# By the path relative to the scene: size in bytes, time of modification in nanoseconds, and digest. Reports of earlier
+# versions have the size alone.
+OwnedFiles = dict[str, Any]
 
 
 def read_report(scene: Path) -> dict[str, Any] | None:
@@ -29,34 +32,59 @@ def read_report(scene: Path) -> dict[str, Any] | None:
 
 
 def list_files(folder: Path, name: str) -> OwnedFiles:
-    """List the files in a folder that becomes the folder `name` of the scene, with their sizes in bytes."""
+    """List the files in a folder that becomes the folder `name` of the scene, with their states."""
     files = (path for path in folder.rglob("*") if path.is_file())
-    return {f"{name}/{path.relative_to(folder).as_posix()}": path.stat().st_size for path in files}
+    return {f"{name}/{path.relative_to(folder).as_posix()}": _state(path) for path in files}
+
+
+def _state(path: Path) -> list:
+    """Return size, time of modification and digest of a file."""
+    status = path.stat()
+    return [status.st_size, status.st_mtime_ns, hash_file(path)]
+
+
+def hash_file(path: Path) -> str:
+    """Return the SHA-1 digest of a file's bytes."""
+    return hashlib.sha1(path.read_bytes(), usedforsecurity=False).hexdigest()
+
+
+def _is_unchanged(path: Path, recorded: Any) -> bool:
+    """Return whether a file has the recorded state, or only another time of modification, as a copy has."""
+    status = path.stat()
+    if isinstance(recorded, int):
+        return status.st_size == recorded
+    size, modified, digest = recorded
+    return status.st_size == size and (status.st_mtime_ns == modified or hash_file(path) == digest)
 
 
 def unchanged_files(scene: Path, owned: Any) -> OwnedFiles:
-    """Return the files of a record that are still in the scene with their recorded size.
+    """Return the files of a record that are still in the scene, unchanged.
 
     The record is not trusted: it may be forged, or come from another folder. Files outside OWNED_FOLDERS of the scene
     are never returned.
     """
     found: OwnedFiles = {}
     root = scene.resolve()
-    for name, size in owned.items() if isinstance(owned, dict) else ():
+    for name, state in owned.items() if isinstance(owned, dict) else ():
         path = scene / name
-        with suppress(OSError, ValueError):
+        with suppress(OSError, TypeError, ValueError):
             inside = path.resolve() == root / name and name.split("/")[0] in OWNED_FOLDERS
-            if inside and path.is_file() and path.stat().st_size == size:
-                found[name] = size
+            if inside and path.is_file() and _is_unchanged(path, state):
+                found[name] = state
     return found
 
 
 def find_foreign_model_file(scene: Path, report: dict[str, Any]) -> str | None:
     """Return the name of a file below `sparse` that the estimation of a report did not write; None if there is none."""
     recorded = report.get("model_files")
-    for name, size in sorted(list_files(scene / "sparse", "sparse").items()):
-        is_own = recorded.get(name) == size if isinstance(recorded, dict) else name in MODEL_FILES
-        if not is_own and Path(name).name not in IGNORED_NAMES:
+    for path in sorted(path for path in (scene / "sparse").rglob("*") if path.is_file()):
+        name = path.relative_to(scene).as_posix()
+        is_own = name in MODEL_FILES
+        if isinstance(recorded, dict):
+            is_own = False
+            with suppress(TypeError, ValueError):
+                is_own = name in recorded and _is_unchanged(path, recorded[name])
+        if not is_own and path.name not in IGNORED_NAMES:
             return name
     return None
 

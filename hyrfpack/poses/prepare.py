@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 from collections import Counter
@@ -26,13 +25,14 @@ from hyrfpack.data.unusable import INVALID_NAME_REASON
 from hyrfpack.errors import HyrfDataError, strip_path
 from hyrfpack.parallel.threads import thread_count
 from hyrfpack.poses.job import Device
+from hyrfpack.poses.owned_files import hash_file
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 
 # Photos with these endings are copied, because other programs that read scenes know these formats.
 _COPIED_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
 _SUFFIXES_WRITTEN_AS_JPEG = (".jpg", ".jpeg", ".heic", ".heif")  # photos with other endings are rewritten as PNG
 _JPEG_SAVE_OPTIONS = {"quality": 95, "subsampling": 0}
-_PNG_MODES = ("1", "L", "LA", "I", "I;16", "I;16B", "P", "RGB", "RGBA")
+_PNG_MODES = ("1", "L", "LA", "I;16", "I;16B", "P", "RGB", "RGBA")
 _EXIF_ORIENTATION_TAG = 0x0112
 _MAX_BURST_GAP_SECONDS = 2.0  # the median gap between the photos of a sequence is at most this long
 
@@ -114,7 +114,7 @@ def read_headers(
             continue
         size = path.stat().st_size
         if sizes[size] > 1:
-            original = first_with.setdefault((size, _hash_file(path)), source)
+            original = first_with.setdefault((size, hash_file(path)), source)
             if original != source:
                 left_out[source] = f"{COPY_REASON_PREFIX} {original}"
                 continue
@@ -288,10 +288,6 @@ def _count_event(task: str, done: int, count: int) -> TaskEvent:
     return TaskEvent(f"{task} {done}/{count}", done / count)
 
 
-def _hash_file(path: Path) -> str:
-    return hashlib.sha1(path.read_bytes(), usedforsecurity=False).hexdigest()
-
-
 def _make_faces(facts: PhotoFacts, source: str) -> list[Photo]:
     """Return the six faces of a panorama as photos."""
     size = face_size(facts.size[0])
@@ -337,6 +333,8 @@ def _write_photo(photo: Photo, target: Path) -> None:
             copy_file(photo.facts.path, target, keep_metadata=True)
             return
         upright = turn_upright(image, _remaining_orientation(image))
+        if upright.mode == "I":  # PNG has 16 bits
+            upright = Image.fromarray(np.clip(np.asarray(upright), 0, 65535).astype(np.uint16))
         jpeg = target.suffix.lower() in (".jpg", ".jpeg")
         modes = ("L", "RGB") if jpeg else _PNG_MODES
         profile = image.info.get("icc_profile")

@@ -215,7 +215,7 @@ def test_files_beside_the_model_are_never_removed(name, has_list, tmp_path):
     estimate_with_fake_stages(photos, scene)
     if not has_list:
         report = json.loads((scene / "poses.json").read_text())
-        assert report.pop("model_files") == {"sparse/0/cameras.bin": 7}
+        assert list(report.pop("model_files")) == ["sparse/0/cameras.bin"]
         (scene / "poses.json").write_text(json.dumps(report))
     (scene / "sparse" / ".DS_Store").write_bytes(b"of the file manager")
     (scene / name).parent.mkdir(exist_ok=True)
@@ -225,6 +225,28 @@ def test_files_beside_the_model_are_never_removed(name, has_list, tmp_path):
     assert (scene / name).read_bytes() == b"mine"
     (scene / name).unlink()
     estimate_with_fake_stages(photos, scene, overwrite=True)
+
+
+def test_an_edited_photo_of_the_same_size_is_kept_and_a_copied_one_is_replaced(tmp_path):
+    scene, photos = tmp_path / "scene", write_photos(tmp_path / "photos")
+    estimate_with_fake_stages(photos, scene)
+    photo = scene / "images" / "0.png"
+    written = photo.read_bytes()
+    photo.write_bytes(written[:-1] + b"x")
+    with pytest.raises(hyrfpack.HyrfError, match="images: the folder holds files that do not belong"):
+        estimate_with_fake_stages(photos, scene, overwrite=True)
+    photo.write_bytes(written)
+    os.utime(photo, (1, 1))
+    estimate_with_fake_stages(photos, scene, overwrite=True)
+
+
+def test_a_refined_model_of_the_same_size_is_kept(tmp_path):
+    scene, photos = tmp_path / "scene", write_photos(tmp_path / "photos")
+    estimate_with_fake_stages(photos, scene)
+    (scene / "sparse" / "0" / "cameras.bin").write_bytes(b"refined")
+    with pytest.raises(hyrfpack.HyrfError, match=r"cameras\.bin: this file would be removed"):
+        estimate_with_fake_stages(photos, scene, overwrite=True)
+    assert (scene / "sparse" / "0" / "cameras.bin").read_bytes() == b"refined"
 
 
 def test_a_model_that_was_replaced_is_kept(tmp_path):
@@ -302,5 +324,7 @@ def test_a_record_lists_only_unchanged_files_inside_the_scene(tmp_path):
         str(tmp_path / "photos" / "0.png"): size,
         "own.txt": 4,
         "": 0,
+        "images/2.png": [size],
+        "images/3.png": None,
     }
     assert unchanged_files(tmp_path / "scene", forged) == {"images/0.png": size}

@@ -70,6 +70,36 @@ def test_photos_stored_on_their_side_are_written_upright(orientation, name, writ
         assert np.abs(np.asarray(image).astype(float) - upright_picture()).mean() <= most
 
 
+@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "RGBA", "CMYK", "I;16"])
+def test_turned_tiff_files_of_every_mode_are_written_upright(mode, tmp_path):
+    picture = Image.fromarray(upright_picture())
+    grey = np.asarray(picture.convert("L")).astype(np.uint16) * 257
+    stored = Image.fromarray(grey) if mode == "I;16" else picture.convert(mode)
+    tags = Image.Exif()
+    tags[0x0112] = 6
+    (tmp_path / "in").mkdir()
+    stored.transpose(Image.Transpose.ROTATE_90).save(tmp_path / "in" / "a.tif", exif=tags)
+    photos, _ = read_photo_headers(tmp_path / "in")
+    make_images(photos, tmp_path / "out")
+    written, _ = read_pixels(tmp_path / "out" / photos[0].name)
+    expected = np.asarray(Image.fromarray((grey // 257).astype(np.uint8)) if mode == "I;16" else stored.convert("RGB"))
+    expected = expected if expected.ndim == 3 else np.repeat(expected[..., None], 3, axis=2)
+    assert written.shape == expected.shape
+    assert np.abs(written.astype(int) - expected).max() <= 1
+
+
+def test_a_turned_photo_of_32_bit_integers_is_written_with_16_bits(tmp_path):
+    levels = np.arange(60 * 80, dtype=np.int32).reshape(60, 80) * 20 - 1000
+    tags = Image.Exif()
+    tags[0x0112] = 3
+    (tmp_path / "in").mkdir()
+    Image.fromarray(levels[::-1, ::-1].copy()).save(tmp_path / "in" / "a.tif", exif=tags)
+    photos, _ = read_photo_headers(tmp_path / "in")
+    make_images(photos, tmp_path / "out")
+    with Image.open(tmp_path / "out" / photos[0].name) as image:
+        assert np.array_equal(np.asarray(image), np.clip(levels, 0, 65535))
+
+
 def test_a_stop_leaves_photos_that_were_not_begun_unread(tmp_path, monkeypatch):
     read: list[Path] = []
 
