@@ -255,8 +255,13 @@ def _visible_rows(image, ids: np.ndarray) -> np.ndarray:
 
 
 def _pose(image) -> np.ndarray:
-    """Return the (4, 4) camera_from_world of a pycolmap image."""
+    """Return the (4, 4) camera_from_world of a pycolmap image, whose quaternion may be zero."""
     pose = np.eye(4)
+    if not image.cam_from_world().rotation.quat.any():
+        raise HyrfDataError(
+            f"photo {image.name} has no rotation (its quaternion is zero)",
+            fix="remove the photo from the model, or export the model again",
+        )
     pose[:3] = image.cam_from_world().matrix()
     return pose
 

@@ -7,10 +7,11 @@ a model without points.
 from __future__ import annotations
 
 import codecs
+import math
 import struct
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from hyrfpack.errors import HyrfDataError
@@ -48,12 +49,22 @@ def readable_model(model: Path, kind: str) -> Iterator[Path]:
 
 
 def read_image_names(file: Path) -> dict[int, str]:
-    """Read the names of images.txt by image id. A name is all text after the ninth field, including spaces."""
+    """Read the names of images.txt by image id. A name is all text after the ninth field, including spaces.
+
+    Raises:
+        HyrfDataError: the file cannot be read, or a photo lacks its line of 2D points, so that the next photo's line
+            would be taken for it.
+    """
     names = {}
-    for line in _image_lines(_read_text(file)):
+    for number, line, points in _image_entries(_read_text(file)):
         fields = line.split(maxsplit=9)
         if len(fields) == 10 and fields[0].isdecimal():
             names[int(fields[0])] = fields[9].strip()
+        if not _is_list_of_points(points):
+            raise HyrfDataError(
+                f"{file}: line {number + 1} is not a list of 2D points",
+                fix="add a line after each photo's line, which may be empty, or export the model again",
+            )
     return names
 
 
@@ -69,18 +80,27 @@ def _read_text(file: Path) -> str:
         return content.decode("cp1252", errors="replace")  # the encoding of older Windows programs
 
 
-def _image_lines(text: str) -> Iterator[str]:
-    """Yield the first of each photo's two lines; the second lists its 2D points and may be empty."""
-    lines = iter(text.split("\n"))
-    for line in lines:
+def _image_entries(text: str) -> Iterator[tuple[int, str, str]]:
+    """Yield the two lines of each photo and the number of the first; the second lists 2D points and may be empty."""
+    lines = enumerate(text.split("\n"), 1)
+    for number, line in lines:
         if line.strip() and not line.lstrip().startswith("#"):
-            yield line
-            next(lines, None)
+            yield number, line, next(lines, (0, ""))[1]
+
+
+def _is_list_of_points(line: str) -> bool:
+    """Return whether a line may list 2D points, each as x, y and the id of a 3D point, rather than describe a photo."""
+    fields = line.split()
+    if len(fields) % 3:
+        return False
+    with suppress(ValueError):
+        return not fields or math.isfinite(float(fields[-1]))
+    return False
 
 
 def _remove_text_observations(content: bytes) -> bytes:
     """Return images.txt with the same photos and no 2D points, because 2D points refer to 3D points."""
-    lines = [line.rstrip() for line in _image_lines(content.decode(errors="replace"))]
+    lines = [line.rstrip() for _, line, _ in _image_entries(content.decode(errors="replace"))]
     return "".join(f"{line}\n\n" for line in lines).encode()
 
 

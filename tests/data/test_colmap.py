@@ -140,6 +140,11 @@ def _break_infinite_translation(root: Path, folder) -> None:
     (folder.model / "images.bin").write_bytes(folder.tables()["images.bin"])
 
 
+def _break_zero_quaternion(root: Path, folder) -> None:
+    folder.poses[2] = (np.zeros(4), np.zeros(3))
+    (folder.model / "images.bin").write_bytes(folder.tables()["images.bin"])
+
+
 def _break_camera_count(root: Path, folder) -> None:
     content = folder.tables()["cameras.bin"]
     (folder.model / "cameras.bin").write_bytes(struct.pack("<Q", 2) + content[8:])
@@ -208,6 +213,7 @@ def _break_no_photo_folder(root: Path, folder) -> None:
         (_break_nothing_on_disk, "none of the [0-9] photos that"),
         (_break_nan_pose, "002.png"),
         (_break_infinite_translation, "002.png"),
+        (_break_zero_quaternion, "002.png has no rotation"),
         (_break_camera_count, "cameras.bin"),
         (_break_point_count, "points3D.bin"),
         (_break_huge_count, "points3D.bin"),
@@ -252,6 +258,20 @@ def test_a_text_table_with_missing_lines_is_rejected(tmp_path, colmap_folder):
     (folder.model / "points3D.txt").write_text("\n".join(lines[:-1]) + "\n")
 
     with pytest.raises(HyrfDataError, match=r"points3D\.txt: says 3 entries but holds 2"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["{}", "view {} of five.png"], ids=["one word", "several words"])
+def test_a_text_table_without_lines_of_points_is_rejected(tmp_path, colmap_folder, name):
+    folder = colmap_folder(tmp_path)
+    pycolmap.Reconstruction(str(folder.model)).write_text(str(folder.model))
+    for table in folder.model.glob("*.bin"):
+        table.unlink()
+    lines = [line for line in (folder.model / "images.txt").read_text().splitlines() if not line.startswith("#")]
+    photos = [f"{fields} {name.format(file)}" for fields, file in (line.rsplit(" ", 1) for line in lines[::2])]
+    (folder.model / "images.txt").write_text("\n".join(photos) + "\n")
+
+    with pytest.raises(HyrfDataError, match=r"images\.txt: line 2 is not a list of 2D points"):
         load_scene(tmp_path)
 
 
