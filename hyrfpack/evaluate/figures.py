@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 ERROR_LIMIT = 0.2
 # Wider pictures are shrunk to this width.
 MAX_PANEL_WIDTH_PIXELS = 640
-# Small pictures are enlarged by a whole factor, up to this width.
-MAX_ENLARGED_WIDTH_PIXELS = 400
+# Small pictures are enlarged by a whole factor, up to this width and height.
+MAX_ENLARGED_PIXELS = 400
 SMOOTHING_RADIUS_RECORDS = 7
 # Margins of the training curve's axes, as fractions of the figure.
 CURVE_MARGINS = {"left": 0.09, "right": 0.99, "bottom": 0.085, "top": 0.98, "hspace": 0.14}
@@ -212,7 +212,7 @@ def figure_to_svg(figure: Figure) -> str:
 def _panel_size(width: int, height: int) -> tuple[int, int]:
     if width > MAX_PANEL_WIDTH_PIXELS:
         return MAX_PANEL_WIDTH_PIXELS, max(1, round(height * MAX_PANEL_WIDTH_PIXELS / width))
-    times = max(1, MAX_ENLARGED_WIDTH_PIXELS // width)
+    times = max(1, MAX_ENLARGED_PIXELS // max(width, height))
     return times * width, times * height
 
 

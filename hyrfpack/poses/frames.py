@@ -175,9 +175,10 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
     sharp: list[float] = []
     thumbnails: list[np.ndarray] = []
     notes: list[str] = []
-    decoded_count, repeated_count, time, last = 0, 0, 0.0, -np.inf
+    decoded_count, repeated_count, time, last, longest = 0, 0, 0.0, -np.inf, 0.0
     interlaced = changes_size = False
-    for number, time, frame in video.frames():
+    for number, start, frame in video.frames():
+        longest, time = max(longest, start - time), start
         decoded_count = number + 1
         interlaced = interlaced or bool(frame.interlaced_frame)
         if time - last < step * 0.98 and time > last:
@@ -209,7 +210,8 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
             f"{path}: the video has only {format_count(decoded_count, 'frame')}{can_be_decoded}",
             fix=f"{copy_or}film for at least ten seconds",
         )
-    if video.damaged_count or (not changes_size and time < _MIN_DURATION_RATIO * video.seconds):
+    # The last frame is shown for some time, too.
+    if video.damaged_count or (not changes_size and time + longest < _MIN_DURATION_RATIO * video.seconds):
         notes.append(
             f"the video is damaged or cut off: {decoded_count} frames of {time:.1f} s could be read, of "
             f"{video.seconds:.1f} s that it should have; copy it again if there is more"

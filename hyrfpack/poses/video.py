@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 _MIN_REC709_LINES = 720  # videos without a colour tag are read as Rec. 709 from this height on, as players do
+MAX_PIXEL_ASPECT = 4
 # Numbers of colour matrices in ITU-T H.273.
 _H273_UNSPECIFIED = 2
 _H273_REC709 = 1
@@ -27,7 +28,8 @@ class Video:
     Attributes:
         seconds: duration according to the header; 0 if the header has none.
         size: (width, height) of the stored frames in pixels, before rotation.
-        aspect: pixel aspect ratio, the width of a pixel divided by its height.
+        aspect: pixel aspect ratio, the width of a pixel divided by its height; 1 where the header has a ratio beyond
+            MAX_PIXEL_ASPECT, which is damaged.
         damaged_count: number of packets and frames that could not be decoded so far.
     """
 
@@ -36,7 +38,8 @@ class Video:
         self._stream.thread_type = "AUTO"
         self.damaged_count = 0
         self.size = (self._stream.codec_context.width, self._stream.codec_context.height)
-        self.aspect = float(self._stream.sample_aspect_ratio or 1) or 1.0
+        aspect = float(self._stream.sample_aspect_ratio or 1)
+        self.aspect = aspect if 1 / MAX_PIXEL_ASPECT <= aspect <= MAX_PIXEL_ASPECT else 1.0
         length, unit = self._stream.duration, self._stream.time_base
         self.seconds = float(length * unit) if length and unit else (container.duration or 0) / 1e6
 
@@ -99,6 +102,10 @@ def open_video(path: Path) -> Iterator[Video]:
     try:
         if not container.streams.video:
             raise HyrfDataError(f"{path}: the file has no video stream", fix="give the path of a video")
+        if container.streams.video[0].codec_context is None:
+            raise HyrfDataError(
+                f"{path}: the installed FFmpeg cannot decode this kind of video", fix="save it as H.264 (.mp4)"
+            )
         yield Video(container)
     finally:
         container.close()
@@ -123,11 +130,25 @@ def decode_upright(frame: Any, aspect: float) -> Image:
         picture = Image.fromarray(frame.reformat(format="rgb24", src_colorspace=color_matrix).to_ndarray())
     if abs(aspect - 1) > 0.01:
         picture = picture.resize((round(picture.width * aspect), picture.height), Image.Resampling.LANCZOS)
-    quarter_turns = round(frame.rotation / 90) % 4  # counter-clockwise
-    if quarter_turns:
-        rotations = Image.Transpose.ROTATE_90, Image.Transpose.ROTATE_180, Image.Transpose.ROTATE_270
-        picture = picture.transpose(rotations[quarter_turns - 1])
-    return picture
+    return _displayed(picture, frame)
+
+
+def _displayed(picture: Image, frame: Any) -> Image:
+    """Turn and mirror a picture as the display matrix of its frame says, by a multiple of quarter turns.
+
+    The matrix [[a, b, u], [c, d, v], [x, y, w]] moves a pixel at (p, q) to (a p + c q + x, b p + d q + y).
+    """
+    from PIL import Image
+
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return picture
+    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()
+    if abs(c) > abs(a):
+        picture, a, d = picture.transpose(Image.Transpose.TRANSPOSE), c, b
+    if a < 0:
+        picture = picture.transpose(Image.Transpose.FLIP_LEFT_RIGHT)
+    return picture.transpose(Image.Transpose.FLIP_TOP_BOTTOM) if d < 0 else picture
 
 
 def _error_text(error: Exception) -> str:

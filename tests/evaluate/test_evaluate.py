@@ -322,6 +322,11 @@ def test_comparison_takes_any_size(width, height):
     assert 3 * 200 < sheet.width < 2100
 
 
+def test_a_tall_picture_is_not_enlarged(tmp_path):
+    sheet = draw_comparison(torch.zeros(900, 5, 3), torch.ones(900, 5, 3))
+    assert sheet.height < 1000
+
+
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (48, 31), (401, 3), (640, 20)])
 def test_a_comparison_can_be_cut_into_its_pictures_again(width, height):
     photo, render = noisy_and_smooth_pictures(height, width)

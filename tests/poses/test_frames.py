@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -178,6 +179,46 @@ def test_frames_are_written_upright(wall, tmp_path, degrees):
     assert mean_luma_difference(tmp_path / "frames", number, expected) < 4
 
 
+@pytest.mark.parametrize(
+    ("matrix", "show"),
+    [
+        ((-1, 0, 0, 1), lambda pixels: pixels[:, ::-1]),
+        ((1, 0, 0, -1), lambda pixels: pixels[::-1]),
+        ((0, 1, 1, 0), lambda pixels: pixels.transpose(1, 0, 2)),
+        ((0, 1, -1, 0), lambda pixels: np.rot90(pixels, -1)),
+    ],
+    ids=["left to right", "top to bottom", "at the diagonal", "a quarter turn"],
+)
+def test_frames_are_mirrored_as_the_video_says(wall, tmp_path, matrix, show):
+    frames = [crop_wall(wall, 4.0 * number) for number in range(40)]
+    video = write_video(tmp_path / "clip.mp4", frames)
+    header = [round(65536 * value) for value in (1, 0, 0, 0, 1, 0, 0, 0)] + [1 << 30]
+    content, stored = video.read_bytes(), struct.pack(">9i", *header)
+    header[0:2], header[3:5] = ([65536 * value for value in matrix[i : i + 2]] for i in (0, 2))
+    track = content.index(b"tkhd")
+    video.write_bytes(content[:track] + content[track:].replace(stored, struct.pack(">9i", *header), 1))
+    choose_frames(video, tmp_path / "frames")
+    number = frame_numbers(tmp_path / "frames")[2]
+    assert mean_luma_difference(tmp_path / "frames", number, show(frames[number])) < 4
+
+
+def test_a_damaged_pixel_aspect_ratio_is_ignored(wall, tmp_path):
+    def stretched(stream):
+        stream.codec_context.sample_aspect_ratio = Fraction(1000, 1)
+
+    frames = [crop_wall(wall, 4.0 * number) for number in range(40)]
+    choose_frames(write_video(tmp_path / "clip.mp4", frames, set_up=stretched), tmp_path / "frames")
+    with Image.open(next((tmp_path / "frames").glob("*.jpg"))) as picture:
+        assert picture.size == (FRAME_WIDTH, FRAME_HEIGHT)
+
+
+@pytest.mark.parametrize("seconds", [[0.0333 * number for number in range(15)], [*np.arange(14) / 14, 3.0]])
+def test_an_intact_short_video_is_not_called_damaged(wall, tmp_path, seconds):
+    frames = [crop_wall(wall, 8.0 * number) for number in range(15)]
+    times = [round(1000 * time) for time in seconds]
+    assert choose_frames(write_video(tmp_path / "clip.mkv", frames, times=times), tmp_path / "frames").notes == ()
+
+
 def test_frames_at_uneven_times_are_all_found(wall, tmp_path):
     times = np.cumsum(np.random.default_rng(2).integers(5, 200, 50)).tolist()
     frames = [crop_wall(wall, 4.0 * number) for number in range(50)]
@@ -238,6 +279,9 @@ def test_a_video_without_usable_frames_is_a_clear_error(wall, tmp_path):
     cut = tmp_path / "cut.mp4"  # the table of contents is at the end of the file
     cut.write_bytes(whole.read_bytes()[:-2000])
     assert "cannot be read as a video" in frame_error(cut, out)
+    unknown = write_video(tmp_path / "unknown.mkv", moving)
+    unknown.write_bytes(unknown.read_bytes().replace(b"V_MPEG4/ISO/AVC", b"V_MPEG4/ISO/XXX"))
+    assert "cannot decode this kind of video" in frame_error(unknown, out)
     text = tmp_path / "text.mp4"
     text.write_text("no video")
     assert "cannot be read as a video" in frame_error(text, out)
