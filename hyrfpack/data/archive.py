@@ -5,16 +5,18 @@ Archives are not trusted: an entry outside the folder, a link, or an implausible
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
+import re
 import shutil
 import stat
 import tempfile
 import time
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from hyrfpack.cache_folder import open_cache_folder
 from hyrfpack.errors import HyrfDataError, HyrfError, short_reason
@@ -31,6 +33,8 @@ _MAX_PARTIAL_FOLDER_AGE_SECONDS = 24 * 3600
 _archive_by_folder: dict[Path, Path] = {}  # archives that this process has unpacked or found unpacked
 _ENCRYPTED_FLAG = 0x1
 _UTF8_NAME_FLAG = 0x800
+_DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT)
+_POLYCAM_CAMERA = re.compile(r"(.*/)?keyframes/(corrected_)?cameras/")  # start of the path of one of Polycam's cameras
 
 
 def is_archive(path: Path) -> bool:
@@ -44,8 +48,9 @@ def is_archive(path: Path) -> bool:
 def unpack(archive: Path) -> Path:
     """Unpack an archive into the cache folder, unless it is already there, and return the folder of its files.
 
-    If all files of the archive lie in one common folder, that folder is returned. The unpacked files are kept. Another
-    archive of the same name, or a later version of this one, is unpacked into another folder.
+    If all files of the archive lie in one common folder, that folder is returned, except Polycam's `keyframes/`, whose
+    parent is returned. The unpacked files are kept. Another archive of the same name, or a later version of this one,
+    is unpacked into another folder.
 
     Raises:
         HyrfDataError: the archive is damaged, encrypted or hostile, or the disk has no room for its files.
@@ -64,7 +69,7 @@ def unpack(archive: Path) -> Path:
     except OSError as error:
         raise HyrfDataError(
             f"{archive}: its files cannot be unpacked ({error.strerror or error})",
-            fix="make room, or unpack it yourself and give the folder",
+            fix=f"{'make room, or ' * (error.errno in _DISK_FULL_ERRORS)}unpack it yourself and give the folder",
         ) from error
     except (NotImplementedError, RuntimeError) as error:
         raise HyrfDataError(
@@ -106,9 +111,13 @@ def archive_paths_in_errors() -> Iterator[None]:
         raise renamed from error
 
 
-def _common_folder(paths: Iterable[str]) -> Path:
-    """Return the deepest folder that contains all of these relative paths."""
-    return Path(*os.path.commonprefix([path.split("/")[:-1] for path in paths]))
+def _common_folder(paths: Collection[str]) -> Path:
+    """Return the deepest folder that contains all of these relative paths, or the parent of Polycam's keyframes/."""
+    parts = os.path.commonprefix([path.split("/")[:-1] for path in paths])
+    # Polycam's layout is detected by the folder `keyframes`, which may be all that the archive holds.
+    if "keyframes" in parts and any(_POLYCAM_CAMERA.match(path) for path in paths):
+        parts = parts[: parts.index("keyframes")]
+    return Path(*parts)
 
 
 def _checked_entries(archive: Path, content: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
@@ -136,6 +145,12 @@ def _checked_entries(archive: Path, content: zipfile.ZipFile) -> dict[str, zipfi
         if path in entries:
             raise HyrfDataError(f"{archive}: holds '{path[:80]}' twice", fix="make it again")
         entries[path] = info
+    for folder in {parent.as_posix() for path in entries for parent in PurePosixPath(path).parents}:
+        if folder in entries:
+            raise HyrfDataError(
+                f"{archive}: its files cannot be unpacked, because '{folder[:80]}' is both a file and a folder in it",
+                fix="make it again",
+            )
     if not entries:
         raise HyrfDataError(f"{archive}: the archive holds no files", fix="give the archive of a set of photos")
     total = sum(info.file_size for info in entries.values())

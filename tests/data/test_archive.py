@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import zipfile
@@ -49,6 +50,28 @@ def test_an_archive_is_read_like_its_folder(zipped_set):
     assert scene.notes[0].startswith("set.zip was unpacked into ")
 
 
+@pytest.mark.parametrize("top", ["", "top/", "top/keyframes/"])
+def test_an_archive_of_polycams_keyframes_alone_is_read_like_its_folder(tmp_path, pictures, top):
+    pictures(tmp_path / "set" / "keyframes" / "images", ["1.jpg", "2.jpg"])
+    (tmp_path / "set" / "keyframes" / "cameras").mkdir()
+    for stem, x in (("1", 0), ("2", 1)):
+        camera = {"fx": 30, "fy": 30, "cx": 16, "cy": 12, "width": 32, "height": 24}
+        camera |= {f"t_{row}{column}": int(row == column) for row in range(3) for column in range(4)} | {"t_03": x}
+        (tmp_path / "set" / "keyframes" / "cameras" / f"{stem}.json").write_text(json.dumps(camera))
+
+    scene = load_scene(zip_folder(tmp_path / "set", tmp_path / "set.zip", top))
+
+    assert (scene.layout, [view.name for view in scene.views]) == ("polycam", ["1.jpg", "2.jpg"])
+
+
+def test_photos_in_a_folder_named_keyframes_have_names_below_it(tmp_path, pictures):
+    pictures(tmp_path / "set" / "keyframes", ["left/1.jpg", "right/1.jpg"])
+
+    folder = archive.unpack(zip_folder(tmp_path / "set", tmp_path / "set.zip"))
+
+    assert folder.name == "keyframes" and (folder / "left" / "1.jpg").is_file()
+
+
 def test_an_archive_is_unpacked_again_only_after_a_change(zipped_set, cache):
     folder = archive.unpack(zipped_set)
     first = folder / "images" / "000.png"
@@ -94,7 +117,7 @@ def test_a_disk_that_fills_up_leaves_nothing(zipped_set, cache, monkeypatch):
 
     monkeypatch.setattr(shutil, "copyfileobj", full)
 
-    with pytest.raises(HyrfDataError, match="No space left on device"):
+    with pytest.raises(HyrfDataError, match="No space left on device.*make room"):
         load_scene(zipped_set)
     assert list(cache.iterdir()) == []
 
@@ -136,6 +159,24 @@ def test_archives_with_unsafe_names_are_rejected_and_leave_nothing(names, says, 
         load_scene(tmp_path / "a.zip")
     assert "\n" not in str(caught.value) and str(tmp_path / "a.zip") in str(caught.value)
     assert not cache.exists() or list(cache.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        (["top/a", "top/a/b"], "'top/a' is both a file and a folder in it"),
+        (["a/b/c", "a"], "'a' is both a file and a folder in it"),
+        (["a" * 300], "File name too long"),
+    ],
+)
+def test_names_that_no_disk_can_hold_are_not_reported_as_a_lack_of_space(names, says, tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as content:
+        for name in names:
+            content.writestr(name, "x")
+
+    with pytest.raises(HyrfDataError, match=says) as caught:
+        load_scene(tmp_path / "a.zip")
+    assert "make room" not in caught.value.fix
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x05\x06" + bytes(10), b"no archive at all"])
