@@ -98,14 +98,16 @@ class PictureIndex:
     def match(self, names: Iterable[str]) -> NameMatches:
         """Find the files of all names together, so that no file is matched twice.
 
-        These rules apply in order: the exact path; the same path in other letter cases or another Unicode form; the
-        path without its extension; a name that ends with the file's path or vice versa, the longest match first.
+        These rules apply in order: the exact path, to which a name without extension may lack one; the same path in
+        other letter cases or another Unicode form; the path without its extension; a name that ends with the file's
+        path or vice versa, the longest match first.
         """
         wanted_names = list(dict.fromkeys(names))
-        found = {name: file for name in wanted_names if (file := self._find_exact(name)) is not None}
+        exact_files = {name: self._find_exact(name) for name in wanted_names}
+        found = {name: files[0] for name, files in exact_files.items() if len(files) == 1}
         exact = set(found)
-        ambiguous: set[str] = set()
-        for rule in () if len(found) == len(wanted_names) else self._rules:
+        ambiguous = {name for name, files in exact_files.items() if len(files) > 1}
+        for rule in () if len(found) + len(ambiguous) == len(wanted_names) else self._rules:
             fits = {name: rule(name) for name in wanted_names if name not in found and name not in ambiguous}
             taken = set(found.values())
             fits = {name: [file for file in files if file not in taken] for name, files in fits.items()}
@@ -124,14 +126,19 @@ class PictureIndex:
             return file.relative_to(self.folder).as_posix()
         return safe_name(listed)
 
-    def _find_exact(self, name: str) -> Path | None:
-        """Find the file at exactly this path; if the name has no extension of a picture, the file may have one."""
+    def _find_exact(self, name: str) -> list[Path]:
+        """Find the file at exactly this path, or else the files whose paths have a picture's extension added to it."""
         path = self.folder / name.replace("\\", "/")
         # Raw files are not read; the rules may find a picture that was exported from this one.
         if is_raw_name(path.name):
-            return None
-        candidates = [path] if path.name.lower().endswith(PICTURE_SUFFIXES) else [path, *_with_extensions(path)]
-        return next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
+            return []
+        if os.path.isfile(path):
+            return [path]
+        if path.name.lower().endswith(PICTURE_SUFFIXES):
+            return []
+        files = [candidate for candidate in _with_extensions(path) if os.path.isfile(candidate)]
+        # A disk that ignores letter case has the same file under both spellings of an extension.
+        return [file for i, file in enumerate(files) if not any(os.path.samefile(file, other) for other in files[:i])]
 
     @cached_property
     def _rules(self) -> list[Callable[[str], list[Path]]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import string
 import unicodedata
 from pathlib import Path, PurePosixPath
@@ -56,6 +57,9 @@ def test_a_name_matches_the_only_file_that_it_can_mean(tmp_path, listed, there):
     ("listed", "there"),
     [
         ("a.jpg", ["a.png", "a.webp"]),
+        ("a", ["a.png", "a.jpg"]),
+        ("left/a", ["left/a.png", "left/a.PNG"]),
+        ("masks/a", ["masks/a.png", "masks/a.jpg", "a.webp"]),
         ("a.jpg", ["left/a.jpg", "right/a.jpg"]),
         ("right/a.jpg", ["left/a.jpg"]),
         ("a.jpg", ["b.jpg"]),
@@ -74,6 +78,22 @@ def test_an_ambiguous_name_is_not_matched(tmp_path, listed, there):
     make_folder(tmp_path, *there)
 
     assert PictureIndex(tmp_path).find(listed) is None
+
+
+def test_two_names_of_one_file_do_not_make_a_name_ambiguous(tmp_path):
+    make_folder(tmp_path, "a.png")
+    os.link(tmp_path / "a.png", tmp_path / "a.PNG")  # as a disk that ignores letter case shows the file
+
+    assert PictureIndex(tmp_path).find("a") == tmp_path / "a.png"
+
+
+def test_a_name_without_extension_that_fits_two_files_is_noted(tmp_path):
+    make_folder(tmp_path, "a.png", "a.jpg", "b.jpg")
+
+    matches = PictureIndex(tmp_path).match(["a", "b"])
+
+    assert matches.found == {"b": tmp_path / "b.jpg"} and matches.ambiguous == ["a"]
+    assert "1 photo was not matched (such as a)" in matches.notes[0]
 
 
 def test_the_strictest_rule_is_tried_first(tmp_path):
