@@ -93,8 +93,8 @@ def make_scene(
         notes: sentences for the user; more are added.
 
     Raises:
-        HyrfDataError: there is no photo, a name occurs twice, a pose, lens or size is not valid, or no view is left for
-            training.
+        HyrfDataError: there is no photo, a name occurs twice or is that of a panorama's face, a pose, lens or size is
+            not valid, or no view is left for training.
     """
     if not photos:
         raise HyrfDataError(
@@ -110,6 +110,7 @@ def make_scene(
     photos, mask_notes = (photos, []) if masks is None else _assign_masks(photos, masks)
     photos = _orient_masks(photos)
     photos, test_names = _cut_panoramas(photos, test_names)
+    _check_face_names(photos, path)
     views = [_make_view(photo, max_size) for photo in photos]
     train = [view for view in views if view.name not in test_names]
     test = [view for view in views if view.name in test_names]
@@ -157,6 +158,18 @@ def _cut_panoramas(photos: list[Photo], held_out: Set[str]) -> tuple[list[Photo]
     parts = {photo.name: _panorama_faces(photo) if _is_panorama(photo) else [photo] for photo in photos}
     names = {part.name for name in held_out for part in parts.get(name, ())}
     return [part for cut in parts.values() for part in cut], names
+
+
+def _check_face_names(photos: list[Photo], path: Path) -> None:
+    """Raise HyrfDataError if a face of a panorama has the name of another photo."""
+    panoramas = {photo.name: photo.path for photo in photos if photo.face is not None}
+    for photo in photos:
+        panorama = panoramas.get(photo.name)
+        if panorama is not None and panorama != photo.path:
+            raise HyrfDataError(
+                f"{path}: photo {photo.name} has the name of a face of the panorama {panorama.name}",
+                fix="rename the photo, in its folder and in the poses",
+            )
 
 
 def _list_raw_photos_beside(photos: list[Photo]) -> list[Path]:

@@ -242,6 +242,19 @@ def test_whole_panoramas_are_held_out(tmp_path):
     assert {view.name[0] for view in scene.train} == {"b"} and {view.name[0] for view in scene.test} == {"a"}
 
 
+@pytest.mark.parametrize("test_every", [0, 8])
+def test_a_photo_with_the_name_of_a_face_is_rejected(tmp_path, test_every):
+    write_posed_panoramas(tmp_path, 64)
+    (tmp_path / "images" / "b.png").rename(tmp_path / "images" / "a_front.png")
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    content["frames"][1] |= {"file_path": "images/a_front.png", "camera_model": "PINHOLE", "fl_x": 64}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+
+    with pytest.raises(HyrfDataError, match=r"photo a_front.png .* a face of the panorama a.png; rename") as caught:
+        load_scene(tmp_path, test_every=test_every)
+    assert str(caught.value).startswith(f"{tmp_path}: ")
+
+
 def test_a_mask_of_another_shape_is_rejected(tmp_path):
     write_posed_panoramas(tmp_path, 64)
     (tmp_path / "masks").mkdir()
