@@ -20,6 +20,7 @@ from hyrfpack.data.assemble import make_scene, unregistered_note
 from hyrfpack.data.folder import downscale_factor
 from hyrfpack.data.pictures import PictureHeader
 from hyrfpack.data.sidecar_files import PoseEntry, find_listed_folder, find_listed_photos, find_picture_folder
+from hyrfpack.data.text_files import read_text
 from hyrfpack.data.undistort import Lens, brown_coefficients
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Scene
@@ -55,6 +56,8 @@ def read_bundler(path: Path, *, test_every: int, max_size: int) -> Scene:
         raise HyrfDataError(f"{path}: no bundle file ('# Bundle file v0.3')", fix="give the folder that holds it")
     names, listing = _read_list(path, bundle)
     cameras, points, colors = _read_bundle(bundle)
+    if len(names) != len(cameras):  # a photo's name may start with #, too
+        names = [name for name in names if not name.startswith("#")]
     if len(names) != len(cameras):
         raise HyrfDataError(
             f"{bundle}: holds {format_count(len(cameras), 'camera')}, but {listing.name} lists "
@@ -114,7 +117,10 @@ def _is_bundle(file: Path) -> bool:
 
 
 def _read_list(path: Path, bundle: Path) -> tuple[list[str], Path]:
-    """Read the photos' names in the order of the cameras; also return the file that lists them."""
+    """Read the lines of the list of photos without those that are empty; also return the file.
+
+    The lines are the names in the order of the cameras, and perhaps comments.
+    """
     folders = dict.fromkeys((bundle.parent, path))
     lists = (file for folder in folders for pattern in _LIST_PATTERNS for file in sorted(folder.glob(pattern)))
     listing = next((file for file in lists if file.is_file()), None)
@@ -123,15 +129,15 @@ def _read_list(path: Path, bundle: Path) -> tuple[list[str], Path]:
             f"{bundle}: the list of its photos is missing (looked for list.txt and *.lst beside it)",
             fix="export it, too",
         )
-    lines = _read_text(listing).splitlines()
+    lines = read_text(listing).splitlines()
     # Lists that Bundler itself writes have 0 and the focal length from EXIF after each name.
     names = [re.sub(r"\s+0\s+[\d.eE+-]+$", "", line.strip()) for line in lines]
-    return [name for name in names if name and not name.startswith("#")], listing
+    return [name for name in names if name], listing
 
 
 def _read_bundle(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Read the (N, 5, 3) rows of the cameras, (P, 3) points and (P, 3) colours in [0, 1]."""
-    lines = [line for line in _read_text(file).splitlines() if line.strip() and not line.startswith("#")]
+    lines = [line for line in read_text(file).splitlines() if line.strip() and not line.startswith("#")]
     try:
         cameras, points = map(int, lines[0].split()[:2])
     except (IndexError, ValueError) as error:
@@ -165,10 +171,3 @@ def _parse_numbers(lines: list[str], file: Path) -> np.ndarray:
             f"{file}: a line has no three numbers where the format requires them", fix="export it again"
         )
     return np.array(rows, np.float64).reshape(-1, 3)
-
-
-def _read_text(file: Path) -> str:
-    try:
-        return file.read_bytes().decode("utf-8-sig", errors="replace")
-    except OSError as error:
-        raise HyrfDataError(f"{file}: cannot be read ({error.strerror})", fix="restore the file") from error

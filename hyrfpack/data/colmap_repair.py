@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from hyrfpack.data.text_files import read_text
 from hyrfpack.errors import HyrfDataError
 
 _U64_STRUCT = struct.Struct("<Q")
@@ -56,7 +57,7 @@ def read_image_names(file: Path) -> dict[int, str]:
             would be taken for it.
     """
     names = {}
-    for number, line, points in _image_entries(_read_text(file)):
+    for number, line, points in _image_entries(read_text(file)):
         fields = line.split(maxsplit=9)
         if len(fields) == 10 and fields[0].isdecimal():
             names[int(fields[0])] = fields[9].strip()
@@ -66,18 +67,6 @@ def read_image_names(file: Path) -> dict[int, str]:
                 fix="add a line after each photo's line, which may be empty, or export the model again",
             )
     return names
-
-
-def _read_text(file: Path) -> str:
-    """Read a text table as UTF-8, or as cp1252 if it is not valid UTF-8."""
-    try:
-        content = file.read_bytes().removeprefix(codecs.BOM_UTF8)
-    except OSError as error:
-        raise HyrfDataError(f"{file}: cannot be read ({error.strerror})", fix="check its permissions") from error
-    try:
-        return content.decode()
-    except UnicodeDecodeError:
-        return content.decode("cp1252", errors="replace")  # the encoding of older Windows programs
 
 
 def _image_entries(text: str) -> Iterator[tuple[int, str, str]]:

@@ -27,6 +27,7 @@ from hyrfpack.data.sidecar_files import (
     find_picture_folder,
     read_sidecar_points,
 )
+from hyrfpack.data.text_files import read_text
 from hyrfpack.data.transforms import pose_from_camera_axes
 from hyrfpack.data.undistort import Lens, brown_coefficients
 from hyrfpack.errors import HyrfDataError
@@ -38,6 +39,9 @@ _FILM_LONGER_SIDE_MM = 36.0
 # Distances from the Earth's centre at which photos are taken, with a margin.
 _MIN_GEOCENTRIC_RADIUS_METRES = 6.2e6
 _MAX_GEOCENTRIC_RADIUS_METRES = 6.5e6
+# Positions of one capture in degrees lie within this distance, which is 2.2 km of latitude; those in metres usually do
+# not.
+_MAX_GEOGRAPHIC_SPREAD_DEGREES = 0.02
 _EXPORT_ADVICE = "export the registration as COLMAP, Bundler or NeRF transforms instead"
 
 
@@ -98,12 +102,11 @@ def _parse_header(header: str) -> list[str] | None:
 
 
 def _read_table(table: Path) -> tuple[list[str], list[dict[str, float]]]:
-    """Read the photos' names and the parameters of each; missing columns are 0."""
-    try:
-        text = table.read_bytes().decode("utf-8-sig", errors="replace")
-    except OSError as error:
-        raise HyrfDataError(f"{table}: cannot be read ({error.strerror})", fix="restore the file") from error
-    header, _, body = text.partition("\n")
+    """Read the photos' names and the parameters of each; missing columns are 0.
+
+    Lines that start with # are comments, unless all their numbers can be read: a photo's name may start with #, too.
+    """
+    header, _, body = read_text(table).partition("\n")
     columns = _parse_header(header) or []
     names, values = [], []
     try:
@@ -111,7 +114,7 @@ def _read_table(table: Path) -> tuple[list[str], list[dict[str, float]]]:
     except csv.Error as error:
         raise HyrfDataError(f"{table}: not a table that can be read ({error})", fix="export it again") from error
     for number, row in enumerate(rows, 2):
-        if not row or row[0].startswith("#"):
+        if not row or (row[0].startswith("#") and not any(cell.strip() for cell in row[1:])):
             continue
         cells = dict(zip(columns, row, strict=False))
         try:
@@ -119,6 +122,8 @@ def _read_table(table: Path) -> tuple[list[str], list[dict[str, float]]]:
         except ValueError:
             line = {"f": np.nan}
         if len(row) < len(columns) or not np.isfinite(list(line.values())).all():
+            if row[0].startswith("#"):
+                continue
             raise HyrfDataError(
                 f"{table}: line {number} is incomplete or has text in place of a number",
                 fix="export it again",
@@ -141,7 +146,8 @@ def _check_units(positions: np.ndarray, table: Path) -> None:
         spread, middle = np.ptp(positions, axis=0), positions.mean(axis=0)
         geocentric = _MIN_GEOCENTRIC_RADIUS_METRES < np.linalg.norm(middle) < _MAX_GEOCENTRIC_RADIUS_METRES
     across = max(spread[:2])
-    degrees = abs(middle[0]) <= 180 and abs(middle[1]) <= 90 and np.hypot(*middle[:2]) > 100 * across
+    in_range = abs(middle[0]) <= 180 and abs(middle[1]) <= 90 and across <= _MAX_GEOGRAPHIC_SPREAD_DEGREES
+    degrees = in_range and np.hypot(*middle[:2]) > 100 * across
     if geocentric or (len(positions) > 1 and degrees and spread[2] > 100 * across):
         raise HyrfDataError(
             f"{table}: the cameras are in {'geocentric' if geocentric else 'geographic'} coordinates",

@@ -85,6 +85,27 @@ def test_all_known_forms_of_the_list_file_are_read(folder, line):
     assert len(load_scene(folder).views) == 3
 
 
+def test_a_photo_whose_name_starts_with_a_hash_is_no_comment(folder):
+    (folder / "images" / "0.png").rename(folder / "images" / "#0.png")
+    (folder / "list.txt").write_text("#0.png\n1.png\n2.png\n3.png\n")
+
+    assert [view.name for view in load_scene(folder, test_every=0).views] == ["#0.png", "1.png", "2.png"]
+
+
+def test_comments_in_the_list_file_are_ignored(folder):
+    (folder / "list.txt").write_text("# four photos\n0.png\n1.png\n\n2.png\n3.png\n")
+
+    assert len(load_scene(folder).views) == 3
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_names_with_umlauts_are_read_in_the_encoding_of_the_list_file(folder, encoding):
+    (folder / "images" / "0.png").rename(folder / "images" / "ü.png")
+    (folder / "list.txt").write_bytes("ü.png\n1.png\n2.png\n3.png\n".encode(encoding))
+
+    assert [view.name for view in load_scene(folder, test_every=0).views] == ["1.png", "2.png", "ü.png"]
+
+
 @pytest.mark.parametrize("name", ["scene.list.txt", "imagelist.lst", "image_list.txt"])
 def test_all_known_names_of_the_bundle_file_are_read(folder, name):
     (folder / "list.txt").rename(folder / name)

@@ -34,6 +34,13 @@ def rewrite(root, change) -> None:
     (root / "cameras.csv").write_text(change((root / "cameras.csv").read_text()))
 
 
+def move_cameras(text: str, first: tuple[float, ...], second: tuple[float, ...]) -> str:
+    """Replace the positions of both cameras in a table."""
+    for old, position in ((",1,2,3,", first), (",4,5,6,", second)):
+        text = text.replace(old, f",{','.join(map(str, position))},")
+    return text
+
+
 def test_angles_give_the_matrix_that_realityscan_exports(folder):
     camera = load_scene(folder, test_every=0).views[0].camera
 
@@ -59,6 +66,55 @@ def test_columns_may_be_fewer_and_in_another_order(folder):
     rewrite(folder, lambda _: "#f,name,x,y,alt,heading,pitch,roll\n18,a.jpg,1,2,3,0,0,0\n18,b.jpg,2,2,3,0,0,0\n")
 
     assert load_scene(folder).views[0].camera.intrinsics == (16, 16, 16, 12)
+
+
+def test_a_photo_whose_name_starts_with_a_hash_is_no_comment(folder):
+    (folder / "a.jpg").rename(folder / "#a.jpg")
+    comments = "# exported today\n# by RealityScan,,,,,,,,,,,,,,,\n# of, 2, photos\n"
+    rewrite(folder, lambda text: text.replace("\na.jpg", f"\n{comments}#a.jpg"))
+
+    assert [view.name for view in load_scene(folder, test_every=0).views] == ["#a.jpg", "b.jpg"]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_names_with_umlauts_are_read_in_the_encoding_of_the_table(folder, encoding):
+    (folder / "a.jpg").rename(folder / "ü.jpg")
+    table = folder / "cameras.csv"
+    table.write_bytes(table.read_text().replace("a.jpg", "ü.jpg").encode(encoding))
+
+    assert [view.name for view in load_scene(folder, test_every=0).views] == ["b.jpg", "ü.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ((12.0, 30.0, 0.0), (12.2, 30.2, 40.0)),  # up a mast, which sways by 0.3 m
+        ((100.0, 50.0, 1.0), (100.5, 50.2, 1.3)),
+        ((0.0, 0.0, 0.0), (0.001, 0.001, 3.0)),  # up a mast at the origin
+    ],
+)
+def test_local_coordinates_in_metres_are_not_taken_for_degrees(folder, first, second):
+    rewrite(folder, lambda text: move_cameras(text, first, second))
+
+    positions = [view.camera.position for view in load_scene(folder, test_every=0).views]
+
+    np.testing.assert_allclose(positions, (first, second), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ((-120.0871, 38.96708, 2084.4), (-120.0881, 38.96786, 1965.6)),  # a real flight, see test_metashape
+        ((13.05, 55.7, 60.0), (13.0503, 55.7002, 60.4)),  # a handheld walk of 30 m
+        ((8.54, 47.37, 500.0), (8.559, 47.38, 503.0)),  # a flight over 1.8 km at an almost constant altitude
+        ((13.05, 55.7, 20.0), (13.05, 55.7, 60.0)),  # straight up
+    ],
+)
+def test_positions_in_degrees_are_rejected(folder, first, second):
+    rewrite(folder, lambda text: move_cameras(text, first, second))
+
+    with pytest.raises(HyrfDataError, match="the cameras are in geographic coordinates; export them again"):
+        load_scene(folder)
 
 
 def test_other_tables_are_ignored(tmp_path):
