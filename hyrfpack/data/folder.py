@@ -177,9 +177,9 @@ def _walk_files(folder: Path, visited: set[str], is_wanted: Callable[[str], bool
     visited.add(real_path)
     folders = []
     for entry in entries:
-        if entry.is_dir():
+        if _is_folder(entry):
             folders.append(entry)
-        elif is_wanted(entry.name) and entry.is_file():
+        elif is_wanted(entry.name) and _is_file(entry):
             yield folder / entry.name
     # Links come last, so that a folder that is reached twice is listed by its real path.
     for entry in sorted(folders, key=lambda entry: (entry.is_symlink(), entry.name)):
@@ -188,6 +188,22 @@ def _walk_files(folder: Path, visited: set[str], is_wanted: Callable[[str], bool
             continue
         with suppress(PermissionError):
             yield from _walk_files(folder / entry.name, visited, is_wanted, photos_only)
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    """Return whether an entry is a folder or a link to one; a link that leads nowhere, such as to itself, is not."""
+    try:
+        return entry.is_dir()
+    except OSError:
+        return False
+
+
+def _is_file(entry: os.DirEntry[str]) -> bool:
+    """Return whether an entry is a file or a link to one; a link that leads nowhere, such as to itself, is not."""
+    try:
+        return entry.is_file()
+    except OSError:
+        return False
 
 
 def first_readable_photo(photos: Iterable[StrPath]) -> PhotoFacts | None:
@@ -275,7 +291,7 @@ def _device_name(tags: dict[int, Any]) -> str:
 
 def _capture_time(tags: dict[int, Any]) -> float | None:
     """Convert the time of capture to seconds, None if the tags do not state it."""
-    with suppress(ValueError, OverflowError):
+    with suppress(ValueError, OverflowError, OSError):  # OSError: Windows cannot convert times near or before 1970
         seconds = datetime.strptime(str(tags.get(_DATETIME_ORIGINAL_TAG)).strip("\0 "), "%Y:%m:%d %H:%M:%S").timestamp()
         fraction = str(tags.get(_SUBSEC_TIME_ORIGINAL_TAG) or "").strip("\0 ")
         return seconds + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)

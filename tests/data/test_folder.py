@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,14 @@ def test_circular_links_are_followed_once(tmp_path):
     save_photo(tmp_path / "a" / "1.png")
     (tmp_path / "a" / "again").symlink_to(tmp_path)
     assert list_names(tmp_path) == ["a/1.png"]
+
+
+def test_links_that_lead_nowhere_are_ignored(tmp_path):
+    save_photo(tmp_path / "1.png")
+    for name in ("loop", "loop.png"):
+        (tmp_path / name).symlink_to(name)
+    (tmp_path / "missing.png").symlink_to(tmp_path / "not there.png")
+    assert list_names(tmp_path) == ["1.png"]
 
 
 def test_a_missing_folder_is_a_clear_error(tmp_path):
@@ -135,6 +144,20 @@ def test_device_and_time_are_read_from_exif(tmp_path):
     assert read_photo_facts(second).taken - read_photo_facts(first).taken == pytest.approx(2.5)
     bare = read_photo_facts(save_photo(tmp_path / "3.png"))
     assert (bare.device, bare.taken) == ("", None)
+
+
+@pytest.mark.parametrize("error", [OSError(22, "Invalid argument"), OverflowError("mktime argument out of range")])
+def test_a_time_that_the_system_cannot_convert_is_ignored(error, tmp_path, monkeypatch):
+    """On Windows, `datetime.timestamp` raises OSError for times near or before 1970."""
+
+    class UnconvertibleTime(datetime):
+        def timestamp(self):
+            raise error
+
+    monkeypatch.setattr("hyrfpack.data.folder.datetime", UnconvertibleTime)
+    photo = save_photo(tmp_path / "1.jpg", base={0x0110: "Canon EOS R5"}, exif={0x9003: "1970:01:01 00:00:00"})
+    facts = read_photo_facts(photo)
+    assert (facts.device, facts.taken) == ("Canon EOS R5", None)
 
 
 def test_a_file_that_is_no_picture_is_a_clear_error(tmp_path):
