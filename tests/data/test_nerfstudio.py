@@ -45,6 +45,26 @@ def test_intrinsics_of_a_frame_override_global_ones(nerfstudio_folder):
     assert views[1].camera.intrinsics == (30.0, 31.0, 17.0, 11.0)
 
 
+@pytest.mark.parametrize(
+    ("entries", "focal_lengths"),
+    [
+        ({"camera_angle_x": 1.0}, (16 / math.tan(0.5),) * 2),
+        ({"camera_angle_x": 1.0, "camera_angle_y": 0.8}, (16 / math.tan(0.5), 12 / math.tan(0.4))),
+        ({"camera_angle_y": 0.8}, (12 / math.tan(0.4),) * 2),
+        ({"camera_angle_x": 1.0, "fl_y": 40.0}, (16 / math.tan(0.5), 40.0)),
+        ({"camera_angle_x": 1.0, "fl_x": 40.0}, (40.0, 40.0)),
+    ],
+)
+def test_the_field_of_view_of_a_frame_overrides_a_global_focal_length(nerfstudio_folder, entries, focal_lengths):
+    root = nerfstudio_folder()
+    edit_frame(root, 2, **entries)
+
+    views = load_scene(root).views
+
+    np.testing.assert_allclose(views[2].camera.intrinsics[:2], focal_lengths)
+    assert views[1].camera.intrinsics[:2] == (30.0, 31.0)
+
+
 @pytest.mark.parametrize("images", ["images_9", "x" * 300])
 def test_a_missing_photo_folder_is_a_clear_error(nerfstudio_folder, images):
     with pytest.raises(HyrfDataError, match="no photo folder"):
