@@ -22,7 +22,7 @@ def ply_file(path: Path, kind: str, full: float, order: str = "<", faces: bool =
     header += [f"property {kind} {color}" for color in ("red", "green", "blue")]
     header += ["element face 1", "property list uchar int vertex_indices"] if faces else []
     colors = [[full, full // 2 if full > 1 else 0.5, 0], [0, 0, 0]]
-    types = {"uchar": "u1", "ushort": "u2", "float": "f4"}
+    types = {"uchar": "u1", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"}
     layout = np.dtype([("p", order + "f4", 4), ("c", (order or "=") + types[kind], 3)])
     rows = np.array([((*p, 7), tuple(c)) for p, c in zip(POINT_ROWS, colors, strict=True)], layout)
     if order:
@@ -45,6 +45,29 @@ def test_written_points_and_colours_are_read_back(tmp_path, kind, full, half, or
     np.testing.assert_array_equal(points, POINT_ROWS)
     np.testing.assert_allclose(colors, [[1, half, 0], [0, 0, 0]], rtol=0, atol=1e-7)
     assert points.dtype == colors.dtype == np.float64
+
+
+@pytest.mark.parametrize("order", ["<", ""])
+@pytest.mark.parametrize("kind", ["float", "double", "int", "uint"])
+def test_colours_from_0_to_255_in_a_wide_type_are_scaled(tmp_path, kind, order):
+    _, colors = read_ply_points(ply_file(tmp_path / "a.ply", kind, 255, order))
+
+    np.testing.assert_allclose(colors, [[1, 127 / 255, 0], [0, 0, 0]], rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("full", [1.5, 1000.0])
+def test_floating_point_colours_of_another_range_are_clipped(tmp_path, full):
+    _, colors = read_ply_points(ply_file(tmp_path / "a.ply", "float", full))
+
+    assert colors[0, 0] == 1
+
+
+def test_a_colour_that_is_not_finite_does_not_change_the_scale(tmp_path):
+    header = "ply\nformat ascii 1.0\nelement vertex 2\n"
+    header += "".join(f"property float {label}\n" for label in ("x", "y", "z", "red", "green", "blue"))
+    (tmp_path / "a.ply").write_text(f"{header}end_header\n0 0 0 255 51 nan\n0 0 0 inf 0 102\n")
+
+    np.testing.assert_allclose(read_ply_points(tmp_path / "a.ply")[1], [[1, 0.2, 0], [1, 0, 0.4]])
 
 
 def test_trimesh_is_not_needed(tmp_path, monkeypatch):
