@@ -230,11 +230,13 @@ def missing_photos_notes(
             f"{min(missing)}; {_describe_folder(path, min(missing))})",
             fix="put them at the paths that the poses name, as JPEG or PNG",
         )
-    if not missing:
+    # Those that fit several files have a note of their own.
+    absent = [file for file in missing if not any(f"/{file}".endswith(f"/{name}") for name in ambiguous)]
+    if not absent:
         return []
     listed = f"of {len(missing) + len(photos):,} photos listed in {where}"
-    skipped = format_count(len(missing), f"{listed} is not on disk and was", f"{listed} are not on disk and were")
-    return [f"{skipped} skipped (such as {min(missing)})"]
+    skipped = format_count(len(absent), f"{listed} is not on disk and was", f"{listed} are not on disk and were")
+    return [f"{skipped} skipped (such as {min(absent)})"]
 
 
 def unregistered_note(count: int) -> str:

@@ -39,9 +39,11 @@ _FILM_LONGER_SIDE_MM = 36.0
 # Distances from the Earth's centre at which photos are taken, with a margin.
 _MIN_GEOCENTRIC_RADIUS_METRES = 6.2e6
 _MAX_GEOCENTRIC_RADIUS_METRES = 6.5e6
-# Positions of one capture in degrees lie within this distance, which is 2.2 km of latitude; those in metres usually do
-# not.
-_MAX_GEOGRAPHIC_SPREAD_DEGREES = 0.02
+# Positions in degrees lie near each other and far from zero, and heights in metres vary by much larger numbers. Local
+# positions in metres, as along a mast, do so to a lesser degree.
+_MAX_GEOGRAPHIC_SPREAD_DEGREES = 0.02  # 2.2 km of latitude
+_MIN_HEIGHT_RATIO = 100
+_MIN_HEIGHT_RATIO_OF_WIDE_SPREADS = 1000
 _EXPORT_ADVICE = "export the registration as COLMAP, Bundler or NeRF transforms instead"
 
 
@@ -146,9 +148,11 @@ def _check_units(positions: np.ndarray, table: Path) -> None:
         spread, middle = np.ptp(positions, axis=0), positions.mean(axis=0)
         geocentric = _MIN_GEOCENTRIC_RADIUS_METRES < np.linalg.norm(middle) < _MAX_GEOCENTRIC_RADIUS_METRES
     across = max(spread[:2])
-    in_range = abs(middle[0]) <= 180 and abs(middle[1]) <= 90 and across <= _MAX_GEOGRAPHIC_SPREAD_DEGREES
-    degrees = in_range and np.hypot(*middle[:2]) > 100 * across
-    if geocentric or (len(positions) > 1 and degrees and spread[2] > 100 * across):
+    is_wide = across > _MAX_GEOGRAPHIC_SPREAD_DEGREES
+    min_ratio = _MIN_HEIGHT_RATIO_OF_WIDE_SPREADS if is_wide else _MIN_HEIGHT_RATIO
+    in_range = abs(middle[0]) <= 180 and abs(middle[1]) <= 90
+    degrees = in_range and np.hypot(*middle[:2]) > 100 * across and spread[2] > min_ratio * across
+    if geocentric or (len(positions) > 1 and degrees):
         raise HyrfDataError(
             f"{table}: the cameras are in {'geocentric' if geocentric else 'geographic'} coordinates",
             fix="export them again in grid-plane or local Euclidean coordinates",

@@ -242,6 +242,18 @@ def test_broken_cameras_are_a_clear_error(tmp_path, pictures, text, says):
     assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
 
 
+def test_a_label_that_fits_two_photos_is_not_called_missing(tmp_path, pictures):
+    pictures(tmp_path, ["0.jpg", "0.png", "1.jpg"], size=(48, 36))
+    (tmp_path / "cameras.xml").write_text(
+        document(camera("0", NADIR_TRANSFORM) + camera("1", OBLIQUE_TRANSFORM, 1), size=(48, 36))
+    )
+
+    notes = load_scene(tmp_path, test_every=0).notes
+
+    assert any("was not matched (such as 0)" in note for note in notes)
+    assert not any("not on disk" in note for note in notes)
+
+
 def test_labels_that_fit_several_photos_are_an_error(tmp_path, pictures):
     names = [f"{index}.png" for index in range(2)]
     for folder in ("left", "right"):

@@ -108,6 +108,7 @@ def test_local_coordinates_in_metres_are_not_taken_for_degrees(folder, first, se
         ((13.05, 55.7, 60.0), (13.0503, 55.7002, 60.4)),  # a handheld walk of 30 m
         ((8.54, 47.37, 500.0), (8.559, 47.38, 503.0)),  # a flight over 1.8 km at an almost constant altitude
         ((13.05, 55.7, 20.0), (13.05, 55.7, 60.0)),  # straight up
+        ((8.54, 47.37, 500.0), (8.59, 47.39, 590.0)),  # a survey of 4 km over hills
     ],
 )
 def test_positions_in_degrees_are_rejected(folder, first, second):
