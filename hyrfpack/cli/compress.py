@@ -31,6 +31,8 @@ from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
+    import torch
+
     from hyrfpack.compress import CompressionReport
     from hyrfpack.format import FileReport
     from hyrfpack.parallel.ranks import Ranks
@@ -124,7 +126,8 @@ def compress(
         )
         if not ranks.is_main:
             return
-        scores = _score_both_files(model, Path(result.file), scene, part_of_progress(progress, 0.9, 1.0))
+        files = model, Path(result.file)
+        scores = _score_both_files(*files, scene, torch_device, part_of_progress(progress, 0.9, 1.0))
     written = note_rename(output, result.file)
     page = None
     if report is not None:
@@ -207,7 +210,9 @@ def _load_training_photos(model: Path) -> Scene | None:
     return scene
 
 
-def _score_both_files(before: Path, after: Path, scene: Scene | None, progress: Progress) -> dict[str, float]:
+def _score_both_files(
+    before: Path, after: Path, scene: Scene | None, device: torch.device, progress: Progress
+) -> dict[str, float]:
     """Return mean PSNR and SSIM of both files on the held-out photos; empty if there are none."""
     if scene is None or not scene.test:
         return {}
@@ -215,8 +220,10 @@ def _score_both_files(before: Path, after: Path, scene: Scene | None, progress: 
     from hyrfpack.format.parts import load_model_or_parts
     from hyrfpack.progress import part_of_progress
 
-    old = evaluate_model(load_model_or_parts(before), scene.test, progress=part_of_progress(progress, 0.0, 0.5))
-    new = evaluate_model(load_model_or_parts(after), scene.test, progress=part_of_progress(progress, 0.5, 1.0))
+    old, new = (
+        evaluate_model(load_model_or_parts(file).to(device), scene.test, progress=part_of_progress(progress, *shares))
+        for file, shares in ((before, (0.0, 0.5)), (after, (0.5, 1.0)))
+    )
     return {"psnr_before": old.psnr, "psnr": new.psnr, "ssim_before": old.ssim, "ssim": new.ssim}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from hyrfpack.atomic import write_atomic
@@ -105,7 +105,7 @@ class MergedPacker:
         model = decode_parts(read_container(candidate.data, SECTION_CONTENTS))
         device = self.packers[0].model.gaussians.positions.device
         assert isinstance(model, MergedModel)
-        return replace(model, parts=tuple(part.to(device) for part in model.parts))
+        return model.to(device)
 
 
 def mask_scene_views(model: MergedModel, views: Sequence[View]) -> list[View]:

@@ -66,6 +66,10 @@ class MergedModel:
         subsets = (part.subset(some) for part, some in zip(self.parts, chosen, strict=True))
         return MergedModel(self.names, tuple(subsets))
 
+    def to(self, device: torch.device) -> MergedModel:
+        """Return the model with all parts on a device; parts that are elsewhere are moved in place."""
+        return replace(self, parts=tuple(part.to(device) for part in self.parts))
+
     def without_empty_parts(self) -> MergedModel:
         """Return the model of the parts that have Gaussians, at least one."""
         kept = [(name, part) for name, part in zip(self.names, self.parts, strict=True) if len(part)]

@@ -240,3 +240,8 @@ def test_depth_and_normals_of_a_near_small_part_are_those_of_the_part_alone():
     assert known.float().mean() > 0.05
     assert ((merged.depth > 0) == known).float().mean() > 0.99
     torch.testing.assert_close(merged.depth[known].median(), alone.depth[known].median(), rtol=1e-3, atol=0)
+
+
+def test_all_parts_move_to_a_device():
+    moved = split_model(ball_model()).to(torch.device("meta"))
+    assert {parameter.device.type for part in moved.parts for parameter in part.parameters()} == {"meta"}
