@@ -1,66 +1,38 @@
+"""The training loop: what a run computes, records and refuses."""
+
 from __future__ import annotations
 
 import dataclasses
 from contextlib import nullcontext
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from scenes import ball_scene, view_of
+from scenes import view_of
+from short_runs import (
+    SHORT_CONFIG,
+    TRAINING_SETTINGS,
+    make_scene,
+    mean_training_psnr,
+    parameter_bytes,
+    records_without_times,
+    train_trainer,
+)
 
 from hyrfpack.config.train import FIELD_WARMUP_STEPS
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.ops.adam import adam_step
-from hyrfpack.render import RenderSettings, render_view
-from hyrfpack.scene import Picture, Scene
-from hyrfpack.train import DensityConfig, LearningRates, TrainConfig, Trainer
-from hyrfpack.train.checkpoint import load_checkpoint, save_checkpoint
+from hyrfpack.render import render_view
+from hyrfpack.scene import Picture
+from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.density import spatial_order
-from hyrfpack.train.resolution import MIN_BACKGROUND_STRIDE
-
-# Density control acts after steps 2, 7, 12, 17, 22 and 27, with resets after 12 and 22, all within a short run.
-EARLY_DENSITY_CONFIG = DensityConfig(start=0.05, stop=0.68, peak=0.68, excess=1.0, rounds=5, gradient=1e-5, resets=2)
-TRAINING_SETTINGS = RenderSettings(background_stride=MIN_BACKGROUND_STRIDE)  # on small photos
-SHORT_CONFIG = TrainConfig(steps=40, seed=3, max_gaussians=160, density=EARLY_DENSITY_CONFIG)
-
-
-def make_scene(**options) -> Scene:
-    return ball_scene(**{"views": 6, "points": 60, "side": 24, **options})
-
-
-def train_trainer(config: TrainConfig = SHORT_CONFIG, **options) -> Trainer:
-    trainer = Trainer(make_scene(**options), config)
-    assert trainer.run()
-    return trainer
-
-
-def parameter_bytes(trainer: Trainer) -> dict[str, bytes]:
-    return {name: p.detach().numpy().tobytes() for name, p in trainer.model.named_parameters()}
-
-
-def records_without_times(records: list[dict]) -> list[dict]:
-    return [{name: value for name, value in record.items() if name != "seconds"} for record in records]
-
-
-def mean_training_psnr(trainer: Trainer) -> float:
-    """Return the mean PSNR of fresh renders over the training views."""
-    values = []
-    for view in trainer.scene.train:
-        with torch.no_grad():
-            rgb = render_view(trainer.model, view.camera, TRAINING_SETTINGS).rgb.double().numpy()
-        values.append(-10 * np.log10(np.mean((rgb - view.load().composite()) ** 2)))
-    return float(np.mean(values))
 
 
 @pytest.fixture(scope="module")
 def uninterrupted_trainer() -> Trainer:
     """The trainer of the uninterrupted run."""
     return train_trainer()
-
-
-# -- a run -----------------------------------------------------------------------------------------------------------
 
 
 def test_training_reduces_the_loss_and_raises_the_psnr():
@@ -281,156 +253,6 @@ def test_a_completely_masked_photo_does_not_change_the_model():
     assert trainer.records == [] and parameter_bytes(trainer) == before
 
 
-# -- resuming --------------------------------------------------------------------------------------------------------
-
-
-def stop_at(step: int, path: Path, config: TrainConfig = SHORT_CONFIG, **options) -> Trainer:
-    trainer = Trainer(make_scene(**options), config)
-    assert not trainer.run(checkpoint=path, stop=lambda: trainer.step == step)
-    assert trainer.step == step
-    return trainer
-
-
-# 1: before the first regular checkpoint; 2 and 12: directly after a round (and a reset); 14: between rounds, with
-# collected gradients; 30: after density control; 39: one step before the end.
-@pytest.mark.parametrize(
-    "step", [2, 14, *(pytest.param(step, marks=pytest.mark.acceptance) for step in (1, 12, 30, 39))]
-)
-def test_resuming_gives_the_bytes_of_the_uninterrupted_run(step, uninterrupted_trainer, tmp_path):
-    path = tmp_path / "checkpoint.pt"
-    stop_at(step, path)
-
-    resumed = Trainer(make_scene(), SHORT_CONFIG)
-    resumed.load(path)
-    assert resumed.step == step and resumed.run(checkpoint=path)
-
-    assert parameter_bytes(resumed) == parameter_bytes(uninterrupted_trainer)
-    assert records_without_times(resumed.records) == records_without_times(uninterrupted_trainer.records)
-
-
-def test_resuming_again_and_again_gives_the_same_bytes(uninterrupted_trainer, tmp_path):
-    path = tmp_path / "checkpoint.pt"
-    stop_at(5, path)
-    for step in (6, 13, 27):
-        trainer = Trainer(make_scene(), SHORT_CONFIG)
-        trainer.load(path)
-        assert not trainer.run(checkpoint=path, stop=lambda t=trainer, s=step: t.step == s)
-    last = Trainer(make_scene(), SHORT_CONFIG)
-    last.load(path)
-    last.run()
-    assert parameter_bytes(last) == parameter_bytes(uninterrupted_trainer)
-
-
-def test_a_resumed_run_keeps_the_learning_rates_of_its_first_gaussians(tmp_path):
-    trainer = Trainer(make_scene(), SHORT_CONFIG)
-    trainer.spacing = 0.5  # as if the first Gaussians had been found in another way
-    trainer.save(tmp_path / "c.pt")
-    resumed = Trainer(make_scene(), SHORT_CONFIG)
-    resumed.load(tmp_path / "c.pt")
-    assert resumed.learning_rates == LearningRates().at_spacing(0.5)
-    assert resumed.optimizer.rates == resumed.learning_rates
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda tensors, progress: progress.clear(),
-        lambda tensors, progress: tensors.clear(),
-        lambda tensors, progress: progress.update(step=[1]),
-        lambda tensors, progress: progress.update(step=41),
-        lambda tensors, progress: progress.update(resolution=3),
-        lambda tensors, progress: progress.update(records=3),
-        lambda tensors, progress: progress.update(elapsed="x"),
-        lambda tensors, progress: progress.update(elapsed=float("nan")),
-        lambda tensors, progress: tensors.update({"model.gaussians.positions": torch.zeros(3, 2)}),
-        lambda tensors, progress: tensors.update({"model.geometry.grid.table": None}),
-    ],
-)
-def test_a_checkpoint_with_missing_or_wrong_values_is_a_clear_error(damage, tmp_path):
-    path, trainer = tmp_path / "c.pt", Trainer(make_scene(), SHORT_CONFIG)
-    trainer.save(path)
-    tensors, progress = load_checkpoint(path, trainer._settings())
-    damage(tensors, progress)
-    save_checkpoint(path, settings=trainer._settings(), tensors=tensors, progress=progress)
-    with pytest.raises(HyrfTrainingError, match="the checkpoint is damaged"):
-        Trainer(make_scene(), SHORT_CONFIG).load(path)
-
-
-def test_running_out_of_memory_on_resume_does_not_blame_the_checkpoint(tmp_path, monkeypatch):
-    path, trainer = tmp_path / "c.pt", Trainer(make_scene(), SHORT_CONFIG)
-    trainer.save(path)
-
-    def fail(*_):
-        raise torch.OutOfMemoryError("CUDA out of memory")
-
-    monkeypatch.setattr(trainer, "_restore", fail)
-    with pytest.raises(HyrfError, match="the GPU's memory ran out"):
-        trainer.load(path)
-
-
-def test_random_backgrounds_resume_too(tmp_path):
-    config = dataclasses.replace(SHORT_CONFIG, steps=16, background_color="random")
-    expected = train_trainer(config, alpha=True)
-    stop_at(9, tmp_path / "checkpoint.pt", config, alpha=True)
-    resumed = Trainer(make_scene(alpha=True), config)
-    resumed.load(tmp_path / "checkpoint.pt")
-    resumed.run()
-    assert parameter_bytes(resumed) == parameter_bytes(expected)
-
-
-def test_regular_checkpoints_are_written_while_running(tmp_path):
-    path, found = tmp_path / "checkpoint.pt", []
-    trainer = Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, steps=12, checkpoint_every=5))
-    trainer.run(checkpoint=path, progress=lambda _: found.append(path.exists()))
-    assert found == [step > 5 for step in range(1, 13)]
-    trainer.load(path)
-    assert trainer.step == 10
-
-
-def test_saving_what_was_loaded_gives_the_same_state(tmp_path):
-    stopped = stop_at(14, tmp_path / "a.pt")
-    loaded = Trainer(make_scene(), SHORT_CONFIG)
-    loaded.load(tmp_path / "a.pt")
-    assert parameter_bytes(loaded) == parameter_bytes(stopped)
-    for name in ("gradients", "views"):
-        assert torch.equal(getattr(loaded.strategy, name), getattr(stopped.strategy, name))
-    states = stopped.optimizer.state_dict(), loaded.optimizer.state_dict()
-    assert states[0].keys() == states[1].keys()
-    assert all(torch.equal(states[0][key], states[1][key]) for key in states[0])
-
-
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"seed": 4}, "seed"),
-        ({"steps": 41}, "steps"),
-        ({"max_gaussians": 161}, "max_gaussians"),
-        ({"learning_rates": LearningRates(color_logits=(1e-3, 1e-3))}, "learning_rates"),
-        ({"background": False}, "background"),
-    ],
-)
-def test_a_run_with_other_settings_is_not_resumed(change, named, tmp_path):
-    stop_at(1, tmp_path / "checkpoint.pt")
-    with pytest.raises(HyrfTrainingError, match=rf"other settings \(.*{named}"):
-        Trainer(make_scene(), dataclasses.replace(SHORT_CONFIG, **change)).load(tmp_path / "checkpoint.pt")
-
-
-@pytest.mark.parametrize("options", [{"views": 5}, {"side": 20}])
-def test_a_run_on_other_photos_is_not_resumed(options, tmp_path):
-    stop_at(1, tmp_path / "checkpoint.pt")
-    with pytest.raises(HyrfTrainingError, match=r"other settings \(.*views"):
-        Trainer(make_scene(**options), SHORT_CONFIG).load(tmp_path / "checkpoint.pt")
-
-
-def test_a_run_on_moved_cameras_is_not_resumed(tmp_path):
-    stop_at(1, tmp_path / "checkpoint.pt")
-    with pytest.raises(HyrfTrainingError, match="other settings"):
-        Trainer(make_scene(scale=2.0), SHORT_CONFIG).load(tmp_path / "checkpoint.pt")
-
-
-# -- what is not finite ----------------------------------------------------------------------------------------------
-
-
 def test_a_photo_with_nan_stops_the_run_and_is_named():
     scene = make_scene()
     broken = np.array(scene.train[4].load().rgb, np.float32)
@@ -494,139 +316,6 @@ def test_one_broken_gaussian_neither_crashes_nor_spreads(name):
         assert name in str(error)
     else:
         assert all(torch.isfinite(p).all() for p in trainer.model.parameters())
-
-
-# -- hard starts -----------------------------------------------------------------------------------------------------
-
-
-def scene_with_points(points) -> Scene:
-    scene, points = make_scene(), np.asarray(points, np.float64)
-    return dataclasses.replace(scene, points=points, point_colors=np.full((len(points), 3), 0.5, np.float32))
-
-
-def scene_with_views(views) -> Scene:
-    return dataclasses.replace(make_scene(), train=list(views))
-
-
-def black_scene() -> Scene:
-    black = Picture(np.zeros((24, 24, 3), np.uint8))
-    return scene_with_views(view_of(view.name, view.camera, black) for view in make_scene().train)
-
-
-def same_way_scene() -> Scene:
-    """Return a scene with the same photo six times."""
-    view = make_scene().train[0]
-    return scene_with_views(dataclasses.replace(view, name=f"{i}.png") for i in range(6))
-
-
-def invisible_scene() -> Scene:
-    nothing = Picture(np.zeros((24, 24, 3), np.uint8), np.zeros((24, 24), np.uint8))
-    views = [view_of(view.name, view.camera, nothing) for view in make_scene().train]
-    return dataclasses.replace(scene_with_points(np.zeros((0, 3))), train=views, has_alpha=True)
-
-
-HARD_STARTS = {
-    "all points coincident": lambda: scene_with_points(np.tile([0.1, 0.2, 0.3], (50, 1))),
-    "one point": lambda: scene_with_points([[0.0, 0.0, 0.0]]),
-    "ten points": lambda: scene_with_points(np.random.default_rng(0).normal(size=(10, 3)) * 0.3),
-    "no points": lambda: scene_with_points(np.zeros((0, 3))),
-    "points a million units away": lambda: scene_with_points(np.random.default_rng(0).normal(size=(50, 3)) + 1e6),
-    "a few points a million units away": lambda: scene_with_points(
-        np.vstack([make_scene().points, np.full((5, 3), 1e6)])
-    ),
-    "points behind every camera": lambda: scene_with_points(np.random.default_rng(0).normal(size=(50, 3)) + (0, 0, 30)),
-    "points on the cameras": lambda: scene_with_points([view.camera.position for view in make_scene().train]),
-    "one view": lambda: scene_with_views(make_scene().train[:1]),
-    "one view and no points": lambda: dataclasses.replace(
-        scene_with_points(np.zeros((0, 3))), train=make_scene().train[:1]
-    ),
-    "black pictures": black_scene,
-    "the same view six times": same_way_scene,
-    "nothing covered": invisible_scene,
-}
-
-
-# The integration layer trains from these for longer in tests/hard_cases/test_training.py.
-STARTS_TESTED_ELSEWHERE = {
-    "all points coincident",
-    "one point",
-    "ten points",
-    "points a million units away",
-    "one view",
-    "one view and no points",
-    "the same view six times",
-}
-
-
-@pytest.mark.parametrize(
-    "start",
-    [
-        pytest.param(start, marks=[pytest.mark.acceptance] if start in STARTS_TESTED_ELSEWHERE else [])
-        for start in HARD_STARTS
-    ],
-)
-def test_hard_starts_train_to_finite_parameters(start):
-    trainer = Trainer(HARD_STARTS[start](), dataclasses.replace(SHORT_CONFIG, steps=20))
-    losses = []
-    trainer.run(progress=lambda event: losses.append(event.loss))
-    assert 1 <= len(trainer.model) <= 160
-    assert all(torch.isfinite(p).all() for p in trainer.model.parameters())
-    assert np.mean(losses[-4:]) <= np.mean(losses[:4])
-
-
-def opaque_object_on_a_plain_wall() -> Scene:
-    """Return photos as a turntable gives them: no coverage, no points and no background sphere for the wall."""
-    return dataclasses.replace(ball_scene(points=0), layout="blender")
-
-
-@pytest.mark.parametrize(
-    ("make", "config", "gain"),
-    [
-        (lambda: ball_scene(points=12), TrainConfig(steps=200, max_gaussians=12), 6),
-        pytest.param(
-            lambda: ball_scene(points=30),
-            TrainConfig(steps=300, max_gaussians=500),
-            12,
-            marks=pytest.mark.acceptance,
-        ),
-        pytest.param(
-            lambda: ball_scene(points=30),
-            TrainConfig(steps=300, max_gaussians=500, background=False),
-            6,
-            marks=pytest.mark.acceptance,
-        ),
-        pytest.param(
-            opaque_object_on_a_plain_wall,
-            TrainConfig(steps=400, max_gaussians=500),
-            12,
-            marks=pytest.mark.acceptance,
-        ),
-    ],
-    ids=["no room", "sphere", "no sphere", "object"],
-)
-def test_sparse_opaque_scenes_do_not_collapse(make, config, gain):
-    trainer = Trainer(make(), config)
-    first, before, counts = len(trainer.model), mean_training_psnr(trainer), []
-    trainer.run(progress=lambda event: counts.append(event.gaussians))
-    assert min(counts) > first / 2
-    assert mean_training_psnr(trainer) > before + gain
-
-
-# Without a warm-up of the fields' learning rate, all of these runs collapse. With one of 10 steps, the last one does.
-@pytest.mark.parametrize(
-    ("seed", "budget"),
-    [
-        (0, 500),
-        *(pytest.param(*run, marks=pytest.mark.acceptance) for run in [(19, 500), (2, 500), (5, 500), (1, 2000)]),
-    ],
-)
-def test_random_gaussians_do_not_grow_until_they_fill_the_scene(seed, budget):
-    trainer = Trainer(opaque_object_on_a_plain_wall(), TrainConfig(steps=400, max_gaussians=budget, seed=seed))
-    before = mean_training_psnr(trainer)
-    trainer.run(stop=lambda: trainer.step == 120)
-    # The largest scale that a Gaussian in the scene's box can have is 1.
-    assert trainer.model.decode_geometry().scales.median() < 0.1
-    assert mean_training_psnr(trainer) > before + 8
 
 
 def test_only_untrained_models_have_a_warm_up():
