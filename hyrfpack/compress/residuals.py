@@ -49,7 +49,8 @@ def quantize_residuals(
         mean = np.bincount(classes, weights.mean(axis=1), class_count) / members
         codes = choose_step_codes(np.where(mean > 0, mean, 1), distortion)
         steps = (decode_step(codes) / FIXED_POINT_ONE)[classes][:, None]
-        nearest = np.clip(np.rint(values[:, columns] / steps), -MAX_ABS_SYMBOL, MAX_ABS_SYMBOL).astype(np.int32)
+        limit = MAX_ABS_SYMBOL - reach  # The chosen symbol lies up to `reach` steps beyond the nearest one.
+        nearest = np.clip(np.rint(values[:, columns] / steps), -limit, limit).astype(np.int32)
         bands.append((band, weights, values[:, columns], codes, steps, nearest))
     flags = zero_error > price * values.shape[1]
     chosen = [nearest for *_, nearest in bands]

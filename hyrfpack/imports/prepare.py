@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -32,6 +32,9 @@ LIGHT_MEASUREMENT_VIEWS = 64
 # The faintest Gaussians that together send less than this share of all light are left out. Compression prunes others
 # as the target PSNR allows.
 FAINT_LIGHT_SHARE = 1e-4
+# A colour of this coefficient saturates each pixel in which it weighs 0.004 % or more, so that larger ones hardly
+# change a picture. Sensitivities of far larger ones overflow, and their residuals take too many steps for a file.
+MAX_ABS_HARMONIC = 1e5
 MIN_SHOWN_GAUSSIANS_SHARE = 0.01  # Given cameras that show fewer of the Gaussians belong to another scene.
 
 
@@ -70,6 +73,7 @@ def prepare_model(
         True
     """
     progress(TaskEvent("choosing viewpoints", 0.0))
+    splats = _clamp_harmonics(splats, name)
     weighted = WeightedSplats.from_splats(splats, name)
     original = Drawable.from_splats(splats, weighted.frame, device)
     chosen, validation, test = _choose_cameras(weighted, original, config, cameras)
@@ -95,6 +99,19 @@ def prepare_model(
     progress(TaskEvent("rendering held-out views", 0.6))
     validation_views, test_views = (ReferenceViews.from_splats(original, views) for views in (validation, test))
     return PreparedModel(model, chosen, validation_views, test_views)
+
+
+def _clamp_harmonics(splats: Splats, name: str) -> Splats:
+    """Return splats with harmonics of at most MAX_ABS_HARMONIC, and log a warning if some are clamped."""
+    is_clamped = (np.abs(splats.harmonics) > MAX_ABS_HARMONIC).any(axis=(1, 2))
+    if not is_clamped.any():
+        return splats
+    _LOG.warning(
+        f"{name}: harmonics of {is_clamped.sum():,} of {format_count(len(splats), 'Gaussian')} are beyond "
+        f"{MAX_ABS_HARMONIC:,.0f}, as if the file were damaged or its training had failed, and are clamped to it; "
+        "export the file again, or remove such Gaussians"
+    )
+    return replace(splats, harmonics=splats.harmonics.clip(-MAX_ABS_HARMONIC, MAX_ABS_HARMONIC))
 
 
 def _choose_cameras(

@@ -19,6 +19,7 @@ from hyrfpack.imports.reference import ReferenceViews
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.formats import ply
+from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
 pytestmark = pytest.mark.usefixtures("quick_calibration", "quick_import")
@@ -118,6 +119,39 @@ def test_unusual_splats_can_be_imported(tmp_path: Path, change) -> None:
     report = import_loaded_splats(change(ball_splats(30)), tmp_path / "x.hyrf", TINY_IMPORT_CONFIG)
     assert report.gaussians_after >= 1
     assert report.psnr > 15
+
+
+def change_harmonic(splats: Splats, value: float) -> Splats:
+    """Return splats whose first Gaussian has another first harmonic, in red."""
+    harmonics = splats.harmonics.copy()
+    harmonics[0, 0, 0] = value
+    return replace(splats, harmonics=harmonics)
+
+
+@pytest.mark.parametrize("value", [1e20, -3e38])
+def test_a_huge_colour_is_clamped_with_a_warning(
+    value: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    splats = change_harmonic(ball_splats(60), value)
+    report = import_loaded_splats(splats, tmp_path / "x.hyrf", TINY_IMPORT_CONFIG, name="ball.ply")
+    bounded = change_harmonic(splats, np.clip(value, -prepare.MAX_ABS_HARMONIC, prepare.MAX_ABS_HARMONIC))
+    alike = import_loaded_splats(bounded, tmp_path / "y.hyrf", TINY_IMPORT_CONFIG, name="ball.ply")
+    assert (tmp_path / "x.hyrf").read_bytes() == (tmp_path / "y.hyrf").read_bytes()
+    assert report.psnr == alike.psnr > 30
+    warnings = [record.getMessage() for record in caplog.records if "clamped" in record.getMessage()]
+    assert len(warnings) == 1 and warnings[0].startswith("ball.ply: harmonics of 1 of 60 Gaussians are beyond 100,000")
+
+
+def test_the_bound_of_harmonics_hardly_changes_a_picture() -> None:
+    splats = ball_splats(60)
+    weighted = WeightedSplats.from_splats(splats, "ball")
+    cameras = sample_viewpoints(weighted, Drawable.from_splats(splats, weighted.frame), 4, 64, 0)
+    before, after = (
+        ReferenceViews.from_splats(Drawable.from_splats(change_harmonic(splats, value), weighted.frame), cameras)
+        for value in (1e30, prepare.MAX_ABS_HARMONIC)
+    )
+    for one, other in zip(before.pictures, after.pictures, strict=True):
+        assert (one - other).square().mean() < 1e-5  # 50 dB
 
 
 @pytest.mark.parametrize(
