@@ -24,7 +24,7 @@ from hyrfpack.counts import format_count
 
 if TYPE_CHECKING:
     from hyrfpack.imports import ImportReport
-    from hyrfpack.scene import Camera
+    from hyrfpack.scene import Camera, Scene
 
 
 @click.command("import", short_help="Compress splats of another program to a small model.")
@@ -71,7 +71,8 @@ def import_(
     config = ImportConfig(**settings)
     check_target(source, output, cameras, overwrite=overwrite)  # before the cameras are read
     cameras = cameras or _find_training_cameras(source)
-    given = None if cameras is None else _read_cameras(cameras)
+    given, scene = (None, None) if cameras is None else _read_cameras(cameras)
+    check_target(source, output, cameras, scene=scene, overwrite=overwrite)
     torch_device = choose_command_device(device)
     context = RunContext(device=torch_device)
     report = import_splats(source, output, config, cameras=given, overwrite=overwrite, context=context)
@@ -108,15 +109,16 @@ def _find_training_cameras(source: Path) -> Path | None:
     return folders[0] / "cameras.json"
 
 
-def _read_cameras(path: Path) -> list[Camera]:
-    """Read the cameras of a JSON file, or of a folder or archive of photos and poses."""
+def _read_cameras(path: Path) -> tuple[list[Camera], Scene | None]:
+    """Read the cameras of a JSON file, or of a folder or archive of photos and poses, which is returned, too."""
     from hyrfpack.cameras.files import cameras_from_json
     from hyrfpack.data import load_scene
     from hyrfpack.data.archive import is_archive
 
     if path.is_dir() or is_archive(path):
-        return [view.camera for view in load_scene(path).views]
-    return [camera for _, camera in cameras_from_json(path)]
+        scene = load_scene(path)
+        return [view.camera for view in scene.views], scene
+    return [camera for _, camera in cameras_from_json(path)], None
 
 
 def _format_ratio(report: ImportReport, size: int | None) -> str:

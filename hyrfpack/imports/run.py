@@ -29,7 +29,7 @@ from hyrfpack.model import ModelConfig
 from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.outputs import Outputs, StrPath
 from hyrfpack.progress import TaskEvent, part_of_progress
-from hyrfpack.scene import Camera
+from hyrfpack.scene import Camera, Scene
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.names import bytes_on_disk, sog_folder
 from hyrfpack.splats.splats import Splats
@@ -114,17 +114,25 @@ def import_splats(
     return dataclasses.replace(result, bytes_source=bytes_on_disk(source))
 
 
-def check_target(source: StrPath | None, target: StrPath, cameras: StrPath | None = None, *, overwrite: bool) -> None:
+def check_target(
+    source: StrPath | None,
+    target: StrPath,
+    cameras: StrPath | None = None,
+    *,
+    scene: Scene | None = None,
+    overwrite: bool,
+) -> None:
     """Check that an import may write `target`. Raises HyrfError otherwise.
 
     Args:
         source: the file or the folder of splats that is read; None for splats in memory.
         target: the file to write.
         cameras: a file of cameras that is read.
+        scene: photos and poses whose cameras are read.
         overwrite: an existing file may be replaced, except those that are read.
     """
     folder = None if source is None else sog_folder(source)
-    Outputs(source, cameras, folder=folder, overwrite=overwrite).file(target, ".hyrf")
+    Outputs(source, cameras, folder=folder, scene=scene, overwrite=overwrite).file(target, ".hyrf")
 
 
 def import_loaded_splats(

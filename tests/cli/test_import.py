@@ -62,6 +62,15 @@ def test_cameras_can_come_from_a_set_of_photos(source: Path, tmp_path: Path) -> 
     assert "8 given viewpoints" in result.stderr
 
 
+@pytest.mark.parametrize("place", ["x.hyrf", "images/x.hyrf"])
+def test_no_import_is_written_among_the_photos_of_its_cameras(place: str, source: Path, tmp_path: Path) -> None:
+    photos = write_demo_scene(tmp_path / "photos", views=10, size=24)
+    before = sorted(tmp_path.rglob("*"))
+    sentence = refused("import", source, "-o", photos / place, "--cameras", photos, "--overwrite", *QUICK_OPTIONS)
+    assert "the same command reads what lies in this folder" in sentence
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_the_cameras_file_of_3dgs_training_is_used(source: Path, cameras: Path, tmp_path: Path) -> None:
     left = tmp_path / "output"
     cloud = left / "point_cloud" / "iteration_30000" / "point_cloud.ply"
