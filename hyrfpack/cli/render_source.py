@@ -20,7 +20,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.files import read_splats
-from hyrfpack.splats.names import bytes_on_disk, is_splats, sog_folder
+from hyrfpack.splats.names import is_splats, sog_folder
 from hyrfpack.splats.viewpoints import WeightedSplats
 
 
@@ -110,4 +110,6 @@ class RenderSource:
         """Size on disk in bytes."""
         if self.scene is not None:
             return self.scene.manifest.total_bytes
+        from hyrfpack.splats.files import bytes_on_disk
+
         return bytes_on_disk(self.path)

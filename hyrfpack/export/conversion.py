@@ -28,9 +28,9 @@ from hyrfpack.export.measure import psnr_of_splats
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.splats.draw import Drawable
-from hyrfpack.splats.files import READABLE_ENDINGS, read_splats
+from hyrfpack.splats.files import READABLE_ENDINGS, bytes_on_disk, read_splats
 from hyrfpack.splats.formats.hints import Hints
-from hyrfpack.splats.names import bytes_on_disk, is_splats, sog_folder
+from hyrfpack.splats.names import is_splats, sog_folder
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS, SplatFormat
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints

@@ -30,8 +30,8 @@ from hyrfpack.out_of_memory import explain_out_of_memory
 from hyrfpack.outputs import Outputs, StrPath
 from hyrfpack.progress import TaskEvent, part_of_progress
 from hyrfpack.scene import Camera, Scene
-from hyrfpack.splats.files import read_splats
-from hyrfpack.splats.names import bytes_on_disk, sog_folder
+from hyrfpack.splats.files import bytes_on_disk, read_splats
+from hyrfpack.splats.names import sog_folder
 from hyrfpack.splats.splats import Splats
 
 _LOG = logging.getLogger(__name__)

@@ -37,7 +37,7 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Event, StepEvent, TaskEvent
 from hyrfpack.progress.status import StepMeans, format_psnr
 from hyrfpack.scene import Scene
-from hyrfpack.splats.names import sog_folder
+from hyrfpack.splats.files import list_source_files
 from hyrfpack.train import Trainer, train_model
 from hyrfpack.train.decisions import measures_length
 from hyrfpack.train.run import is_begun
@@ -247,8 +247,6 @@ def run_import_stage(
     stage_cache: StageCache, source: Path, psnr: float, seed: int, context: RunContext
 ) -> dict[str, Any]:
     """Import splats of another program as `model.hyrf`; return the report of `hyrfpack.import_splats`."""
-    folder = sog_folder(source)
-    files = [source] if folder is None else sorted(path for path in folder.iterdir() if path.is_file())
     config = ImportConfig(psnr=psnr, seed=seed)
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
@@ -262,7 +260,7 @@ def run_import_stage(
             _LOG.warning(f"the target PSNR of the import is {psnr:g} dB, but the file reaches {report.psnr:.1f} dB")
         return report.to_dict(), [PACKED_MODEL]
 
-    inputs = {"splats": files_digest(files, source.parent), "settings": asdict(config)}
+    inputs = {"splats": files_digest(list_source_files(source), source.parent), "settings": asdict(config)}
     return stage_cache.run_stage("import", inputs, execute)
 
 

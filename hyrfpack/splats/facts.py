@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrfpack.splats.names import bytes_on_disk, sog_folder
+from hyrfpack.splats.files import bytes_on_disk
+from hyrfpack.splats.names import sog_folder
 from hyrfpack.splats.splats import Splats
 
 

@@ -12,6 +12,7 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import MAX_WORLD_COORDINATE, Camera
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.hints import Hints
+from hyrfpack.splats.names import sog_folder
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS
 
@@ -84,6 +85,25 @@ def _read_any_splats(path: Path) -> Splats:
         ) from error
 
 
+def list_source_files(path: str | os.PathLike[str]) -> list[Path]:
+    """List the files that `read_splats` reads: one file, or the meta.json of a SOG's folder and the pictures it names.
+
+    Raises:
+        HyrfDataError: the meta.json is damaged.
+        OSError: the meta.json of a folder cannot be read.
+    """
+    folder = sog_folder(path)
+    if folder is None:
+        return [Path(path)]
+    meta = folder / sog.META_NAME
+    return [meta, *(folder / name for name in sog.picture_names(_read_bytes(meta), str(folder)))]
+
+
+def bytes_on_disk(path: str | os.PathLike[str]) -> int:
+    """Return the size in bytes of a file of splats, or of all files of an unbundled SOG."""
+    return sum(file.stat().st_size for file in list_source_files(path))
+
+
 def _read_unbundled_sog(folder: Path) -> dict[str, bytes]:
     """Read the files of an unbundled SOG by name: meta.json and the pictures that it names."""
     names = os.listdir(folder)
@@ -97,10 +117,7 @@ def _read_unbundled_sog(folder: Path) -> dict[str, bytes]:
             f"{_format_names(names)}",
             fix=f"name {(splats or levels)[0]} in it" if splats or levels else nothing,
         )
-    files = {sog.META_NAME: _read_bytes(folder / sog.META_NAME)}
-    for name in sog.picture_names(files[sog.META_NAME], str(folder)):
-        files[name] = _read_bytes(folder / name)
-    return files
+    return {file.name: _read_bytes(file) for file in list_source_files(folder)}
 
 
 def _holds_gaussians(file: Path) -> bool:

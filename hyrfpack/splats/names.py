@@ -33,11 +33,3 @@ def sog_folder(path: str | os.PathLike[str]) -> Path | None:
     path = Path(path)
     folder = path.parent if path.name == SOG_META_NAME else path
     return folder if folder.is_dir() else None
-
-
-def bytes_on_disk(path: str | os.PathLike[str]) -> int:
-    """Return the size of a file of splats in bytes, or the total size of the files in the folder of a SOG."""
-    folder = sog_folder(path)
-    if folder is None:
-        return os.path.getsize(path)
-    return sum(file.stat().st_size for file in folder.iterdir() if file.is_file())

@@ -6,10 +6,12 @@ import json
 import re
 import shutil
 import zipfile
+from types import SimpleNamespace
 
 import pytest
 from commands import hyrfpack, refused, succeeded
 from denied_access import deny_access
+from explicit_balls import ball_splats
 from PIL import Image
 
 from hyrfpack import load_model, load_scene
@@ -22,6 +24,7 @@ from hyrfpack.lock import exclusive_folder
 from hyrfpack.make import Stopped, make_scene, stages
 from hyrfpack.make.progress import Reporter
 from hyrfpack.progress import StageEvent, StepEvent, TaskEvent
+from hyrfpack.splats.formats import sog
 
 # One ending of each kind; tests/export covers the others.
 OUTPUT_ENDINGS = (".hyrf", ".html", ".spz", ".points.ply", "")
@@ -102,6 +105,23 @@ def test_photos_may_lie_beside_a_meta_json_that_is_not_of_splats(photos, poses, 
     (photos / "meta.json").write_text('{"album": "holiday"}')
     make_scene(photos, tmp_path / "scene.hyrf", MakeConfig(quality="draft"))
     assert poses == [photos]
+
+
+def test_other_files_in_the_folder_of_a_sog_do_not_repeat_its_import(tmp_path):
+    recorded = SimpleNamespace(folder=tmp_path, run_stage=lambda name, inputs, execute: inputs)
+
+    def record_inputs() -> dict:
+        return stages.run_import_stage(recorded, tmp_path / "loose", 30.0, 0, RunContext())
+
+    (tmp_path / "loose").mkdir()
+    files = sog.encode_files(ball_splats(9))
+    for name, data in files.items():
+        (tmp_path / "loose" / name).write_bytes(data)
+    before = record_inputs()
+    (tmp_path / "loose" / "notes.txt").write_text("other")
+    assert record_inputs() == before
+    (tmp_path / "loose" / "quats.webp").write_bytes(files["quats.webp"] + b"0")
+    assert record_inputs() != before
 
 
 def test_photos_with_poses_need_no_estimation(posed, poses, tmp_path):

@@ -9,7 +9,8 @@ import pytest
 from scenes import ring
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.splats.files import MAX_FILE_BYTES, READABLE_ENDINGS, read_splats
+from hyrfpack.splats.files import MAX_FILE_BYTES, READABLE_ENDINGS, bytes_on_disk, list_source_files, read_splats
+from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats, normalized_quats
 from hyrfpack.splats.table import FORMATS
@@ -92,6 +93,16 @@ def test_missing_files_unknown_suffixes_and_folders_are_refused(tmp_path):
         with pytest.raises(HyrfDataError) as refusal:
             read_splats(tmp_path / name)
         assert str(tmp_path) in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_the_size_of_an_unbundled_sog_counts_its_own_files_only(tmp_path):
+    files = sog.encode_files(random_splats())
+    for name, data in {**files, "notes.txt": b"other", "unrelated.webp": b"picture"}.items():
+        (tmp_path / name).write_bytes(data)
+    size = sum(map(len, files.values()))
+    for source in (tmp_path, tmp_path / "meta.json"):
+        assert bytes_on_disk(source) == size
+        assert sorted(path.name for path in list_source_files(source)) == sorted(files)
 
 
 def test_a_file_above_the_size_limit_is_refused_before_it_is_read(tmp_path):
