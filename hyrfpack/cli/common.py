@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -190,7 +191,7 @@ def read_scene(
 
 def note_rename(asked: Path, written: Path | str) -> Path:
     """Return the path that was written, and print a note if another one was requested."""
-    if Path(written) != asked:
+    if os.path.realpath(written) != os.path.realpath(asked):  # `make` gives the full path of an output such as ".."
         note(describe_rename(asked, written))
     return Path(written)
 

@@ -458,7 +458,8 @@ def test_an_output_without_a_name_is_rejected_or_the_current_folder(finished_wor
     assert (tmp_path / "player" / "index.html").is_file() and (tmp_path / "player.work" / "make.json").is_file()
     (tmp_path / "site" / "assets").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "site" / "assets")
-    succeeded("make", finished_work / "model.hyrf", "-o", "..")
+    result = succeeded("make", finished_work / "model.hyrf", "-o", "..")
+    assert "in the meantime" not in result.stderr
     assert (tmp_path / "site" / "index.html").is_file() and (tmp_path / "site.work" / "make.json").is_file()
 
 
