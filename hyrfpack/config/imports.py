@@ -9,6 +9,7 @@ from hyrfpack.config.settings import Range, Seed, check_settings
 from hyrfpack.errors import HyrfError
 
 DEFAULT_IMPORT_PSNR_DB = 37.0
+MAX_IMPORT_PSNR_DB = 60
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,8 @@ class ImportConfig:
         seed: random seed. On a CPU, the same seed gives the same file.
     """
 
-    psnr: Annotated[float | None, Range(10, 60, unit="dB")] = None
-    worst: Annotated[float | None, Range(10, 60, unit="dB")] = None
+    psnr: Annotated[float | None, Range(10, MAX_IMPORT_PSNR_DB, unit="dB")] = None
+    worst: Annotated[float | None, Range(10, MAX_IMPORT_PSNR_DB, unit="dB")] = None
     target_bytes: Annotated[int | None, Range(1, unit="bytes")] = None
     size: Annotated[int, Range(16, 4096, unit="pixels")] = 400
     views: Annotated[int, Range(1)] = 240

@@ -14,7 +14,7 @@ import numpy as np
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.checks import check_type
-from hyrfpack.config.imports import ImportConfig
+from hyrfpack.config.imports import MAX_IMPORT_PSNR_DB, ImportConfig
 from hyrfpack.context import RunContext
 from hyrfpack.counts import format_count
 from hyrfpack.format.codec import decode_model
@@ -204,7 +204,7 @@ def import_loaded_splats(
     if config.target_bytes is None and _falls_short(reached_psnr, config.target_psnr):
         _LOG.warning(_shortfall(reached_psnr, unpacked_psnr, config, has_cameras=cameras is not None))
     if config.worst is not None and _falls_short(min(scores), config.worst):
-        _LOG.warning(_worst_shortfall(min(scores), min(unpacked_scores), config.worst))
+        _LOG.warning(_worst_shortfall(min(scores), min(unpacked_scores), config.worst, has_cameras=cameras is not None))
     return ImportReport(
         gaussians_before=len(splats),
         gaussians_after=len(decoded),
@@ -244,7 +244,7 @@ def _shortfall(reached_psnr: float, unpacked_psnr: float, config: ImportConfig, 
         f"viewpoints ({unpacked_psnr:.1f} dB before compression)"
     )
     if not _falls_short(unpacked_psnr, config.target_psnr):
-        return f"{outcome}; set a higher target with `psnr`"
+        return f"{outcome}; {_advise_higher_target(config.target_psnr, 'target with `psnr`', has_cameras)}"
     if has_cameras:
         return (
             f"{outcome}; Gaussians that the given cameras hardly show are left out, and opacities and scales are "
@@ -253,10 +253,25 @@ def _shortfall(reached_psnr: float, unpacked_psnr: float, config: ImportConfig, 
     return f"{outcome}; opacities and scales are limited in a model, so set a lower `psnr`"
 
 
-def _worst_shortfall(reached_psnr: float, unpacked_psnr: float, asked: float) -> str:
+def _advise_higher_target(asked: float, setting: str, has_cameras: bool) -> str:
+    """Return what the user can do where the model reaches a target PSNR and the compressed file does not.
+
+    Args:
+        asked: the target PSNR, in dB.
+        setting: the setting that holds it, in the words of the message.
+        has_cameras: whether the user gave the viewpoints.
+    """
+    if asked < MAX_IMPORT_PSNR_DB:
+        return f"set a higher {setting}"
+    more = "give more `cameras`" if has_cameras else "name many viewpoints with `cameras`"
+    return f"{MAX_IMPORT_PSNR_DB:g} dB is the highest target, so {more}, at which the compression is decided"
+
+
+def _worst_shortfall(reached_psnr: float, unpacked_psnr: float, asked: float, *, has_cameras: bool = False) -> str:
     """Describe how far the worst held-out view falls short of the PSNR asked for, and what the user can do about it."""
-    remedy = "lower" if _falls_short(unpacked_psnr, asked) else "higher"
+    is_limited = _falls_short(unpacked_psnr, asked)
+    remedy = "set a lower `worst`" if is_limited else _advise_higher_target(asked, "`worst`", has_cameras)
     return (
         f"the target PSNR of the worst view is {asked:g} dB, but the worst held-out view has {reached_psnr:.1f} dB "
-        f"({unpacked_psnr:.1f} dB before compression); set a {remedy} `worst`"
+        f"({unpacked_psnr:.1f} dB before compression); {remedy}"
     )

@@ -262,6 +262,13 @@ def test_a_missed_target_advises_another_psnr() -> None:
     assert not run._falls_short(37.04, 37.04)
 
 
+def test_a_missed_target_that_is_the_highest_advises_more_cameras() -> None:
+    given = run._shortfall(58, 80, ImportConfig(psnr=60), has_cameras=True)
+    sampled = run._worst_shortfall(58, 80, 60, has_cameras=False)
+    for sentence, remedy in ((given, "give more `cameras`"), (sampled, "name many viewpoints with `cameras`")):
+        assert "set a higher" not in sentence and f"60 dB is the highest target, so {remedy}" in sentence
+
+
 def test_a_target_missed_with_few_cameras_advises_more_cameras(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
