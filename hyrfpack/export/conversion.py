@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean
 
@@ -41,6 +41,8 @@ MEASURED_VIEWS = 12
 MEASURED_SIZE_PIXELS = 400
 # Smaller Gaussians are points in pictures of the whole scene, so that it does not show if their scales are clamped.
 MIN_VISIBLE_SCALE_RADII = 1e-3
+# Rounding that leaves a lower PSNR is reported: such pictures visibly differ.
+MIN_ROUNDED_PSNR_DB = 30.0
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,8 @@ def convert_splats(
 ) -> ConversionReport:
     """Convert splats between the formats of other programs, in their own axes and units, and measure the loss.
 
-    A warning is logged for each property of the splats that the format cannot hold.
+    A warning is logged for each property of the splats that the format cannot hold, and if its rounding leaves less
+    than MIN_ROUNDED_PSNR_DB.
 
     Args:
         source: .ply (plain or compressed), .splat, .spz, .sog, or the folder of an unbundled SOG.
@@ -141,7 +144,11 @@ def _convert(
     data = kind.encode(kept, hints)
     progress(TaskEvent("reading the file back", 0.5))
     after = kind.decode(data, str(target))
-    psnr = _measure_psnr(whole, after, weighted, part_of_progress(progress, 0.6, 1.0))
+    psnr = _measure_psnr(whole, after, weighted, part_of_progress(progress, 0.6, 0.9))
+    if fmean(psnr) < MIN_ROUNDED_PSNR_DB and not kind.stores_floats:
+        alike = replace(after, antialiased=kept.antialiased)  # that a format cannot store this is reported above
+        rounding = _measure_psnr(kept, alike, weighted, part_of_progress(progress, 0.9, 1.0))
+        _warn_of_rounding(kind, fmean(rounding))
     written = write_atomic(target, data, overwrite=overwrite)
     return ConversionReport(
         file=str(written),
@@ -233,6 +240,16 @@ def _warn_of_clamped_scales(kind: SplatFormat, is_clamped: np.ndarray, than: str
             f"scales of {is_clamped.sum():,} of {len(is_clamped):,} Gaussians are {than} than {limit:.3g} units, the "
             f"limit of {kind.ending}, and are clamped to it: choose another format, or change the scene's unit "
             f"({suggest_command('import')}, {suggest_command('edit')} with `scale`, {suggest_command('export')})"
+        )
+
+
+def _warn_of_rounding(kind: SplatFormat, psnr: float) -> None:
+    """Log a warning if the rounding of a format, without what was left out on purpose, leaves a low PSNR in dB."""
+    if psnr < MIN_ROUNDED_PSNR_DB:
+        able = ", ".join(row.ending for row in FORMATS.values() if row.stores_floats)
+        _LOG.warning(
+            f"{kind.ending} leaves {psnr:.1f} dB, because its numbers are too coarse for this scene; choose another "
+            f"format ({able})"
         )
 
 

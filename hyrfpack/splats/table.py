@@ -45,20 +45,24 @@ class SplatFormat(FileKind):
         decode: turns the bytes of a file, and its name in error messages, into splats in the axes of the splats that
             `encode` took. Raises HyrfDataError if the bytes are damaged or of another format.
         is_readable: whether `read_splats` accepts the format. The others are decoded only to measure what was written.
+        stores_floats: whether all numbers are stored with 32 bits, so that the range of a scene costs no precision.
     """
 
     encode: Callable[[Splats, Hints], bytes]
     decode: Callable[[bytes, str], Splats]
     is_readable: bool = False
+    stores_floats: bool = False
 
 
 def _usd_format(extension: usd.Extension) -> SplatFormat:
     encode, decode = partial(usd.encode, extension=extension), partial(usd.decode, extension=extension)
-    return SplatFormat(ending=f".{extension}", encode=encode, decode=decode, module=usd.REQUIRED_MODULE)
+    return SplatFormat(
+        ending=f".{extension}", encode=encode, decode=decode, module=usd.REQUIRED_MODULE, stores_floats=True
+    )
 
 
 _FORMAT_ROWS = (
-    SplatFormat(ending=".ply", encode=ply.encode, decode=ply.decode, is_readable=True),
+    SplatFormat(ending=".ply", encode=ply.encode, decode=ply.decode, is_readable=True, stores_floats=True),
     SplatFormat(
         ending=".splat",
         encode=splat.encode,
@@ -76,7 +80,7 @@ _FORMAT_ROWS = (
         max_scale=spz.MAX_SCALE,
         stores_antialiased=True,
     ),
-    SplatFormat(ending=".glb", encode=gltf.encode, decode=gltf.decode),
+    SplatFormat(ending=".glb", encode=gltf.encode, decode=gltf.decode, stores_floats=True),
     *map(_usd_format, usd.EXTENSIONS),
     SplatFormat(ending=".sog", encode=sog.encode, decode=sog.decode, is_readable=True, stores_antialiased=True),
 )

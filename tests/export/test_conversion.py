@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -62,6 +63,36 @@ def test_every_pair_of_formats_keeps_positions_and_appearance(before, after, tmp
     lost_harmonics = original.degree > converted.degree
     assert report.views == 2 and report.psnr_worst <= report.psnr
     assert report.psnr > (15 if lost_harmonics else 35)
+
+
+def with_outlying_color(splats: Splats) -> Splats:
+    harmonics = splats.harmonics.copy()
+    harmonics[0, 0, 0] = 1e30
+    return replace(splats, harmonics=harmonics)
+
+
+@pytest.mark.parametrize(
+    ("ending", "change"),
+    [
+        pytest.param(".spz", lambda s: replace(s, positions=s.positions + (5e5, 4e6, 100)), id="far"),
+        pytest.param(".sog", with_outlying_color, id="outlier"),
+    ],
+)
+def test_a_low_psnr_by_rounding_is_a_warning_that_names_other_formats(ending, change, tmp_path, caplog):
+    source = write_splats(tmp_path, ".ply", change(ball_splats(300)))  # more colours than a codebook
+    report = hyrfpack.convert_splats(source, tmp_path / f"after{ending}")
+    assert report.psnr < 30
+    assert f"{ending} leaves {report.psnr:.1f} dB, because its numbers are too coarse" in caplog.text
+    assert "choose another format (.ply, .glb, .usda, .usdc, .usdz)" in caplog.text
+    caplog.clear()
+    assert hyrfpack.convert_splats(source, tmp_path / "after.glb").psnr > 60
+    assert not caplog.text
+
+
+def test_what_is_left_out_on_purpose_is_not_reported_as_rounding(tmp_path, caplog):
+    source = write_splats(tmp_path, ".ply", ball_splats(GAUSSIAN_COUNT))
+    report = hyrfpack.convert_splats(source, tmp_path / "after.spz", ConvertConfig(min_opacity=0.6, degree=0))
+    assert report.psnr < 30 and "too coarse" not in caplog.text
 
 
 def test_a_lossless_format_has_the_maximum_psnr(tmp_path):
