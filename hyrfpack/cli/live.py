@@ -30,6 +30,12 @@ def view_options(command: Command) -> Command:
     return with_options
 
 
+def check_view_options(view: bool, view_port: int | None) -> None:
+    """Raise UsageError if --view-port is given without --view."""
+    if view_port is not None and not view:
+        raise click.UsageError("--view-port is the port of --view; give both of them")
+
+
 @contextmanager
 def serve_training_view(title: str, view: bool, view_port: int | None) -> Iterator[Callable[[Trainer], None] | None]:
     """Serve a page that shows the training, if --view asks for it, while the block runs.
@@ -45,8 +51,7 @@ def serve_training_view(title: str, view: bool, view_port: int | None) -> Iterat
         UsageError: --view-port is given without --view.
         HyrfError: nothing can listen at this port.
     """
-    if view_port is not None and not view:
-        raise click.UsageError("--view-port is the port of --view; give both of them")
+    check_view_options(view, view_port)
     if not view:
         yield None
         return

@@ -18,7 +18,7 @@ from hyrfpack.cli.common import (
     print_json,
 )
 from hyrfpack.cli.console import notes_only_of
-from hyrfpack.cli.live import serve_training_view, view_options
+from hyrfpack.cli.live import check_view_options, serve_training_view, view_options
 from hyrfpack.cli.settings import reject_two_sizes, settings_options
 from hyrfpack.cli.types import INPUT_PATH, OUTPUT, OUTPUT_FOLDER
 from hyrfpack.config.make import MakeConfig
@@ -79,23 +79,21 @@ def make(
     if config.quality is not None and config.minutes is not None:
         raise click.UsageError("--quality and --minutes each decide how long to work; give one of them")
     reject_two_sizes(**settings)
+    check_view_options(view, view_port)
     from hyrfpack.context import RunContext
     from hyrfpack.make import Stopped
-    from hyrfpack.make import make_scene as run
+    from hyrfpack.make.run import make_observed_scene
 
     torch_device = choose_command_device(device)
     try:
-        with (
-            notes_only_of("hyrfpack.make", "hyrfpack.poses", "hyrfpack.live", silent=("hyrfpack.imports",)),
-            serve_training_view(output.name, view, view_port) as observer,
-        ):
-            result = run(
+        with notes_only_of("hyrfpack.make", "hyrfpack.poses", "hyrfpack.live", silent=("hyrfpack.imports",)):
+            result = make_observed_scene(
                 photos,
                 output,
                 config,
                 work=work,
                 overwrite=overwrite,
-                observer=observer,
+                observing=serve_training_view(output.name, view, view_port) if view else None,
                 context=RunContext(device=torch_device),
             )
     except Stopped as stop:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +20,6 @@ from hyrfpack.make.source import LoadSettings, Source
 from hyrfpack.make.stages import EXPORT_FOLDER, PACKED_MODEL
 from hyrfpack.make.state import RECORD_NAME, WorkFolderState, file_digest
 from hyrfpack.outputs import Outputs
-from hyrfpack.train import Trainer
 from hyrfpack.train.setup import check_target
 
 _PHOTO_SETTINGS = (
@@ -50,7 +48,7 @@ class Request:
     config: MakeConfig
     device: torch.device
     overwrite: bool
-    observer: Callable[[Trainer], None] | None
+    is_observed: bool
 
     def __post_init__(self) -> None:
         if self.output.name == "..":  # the product in the work folder gets the name of the output
@@ -104,7 +102,7 @@ class Request:
             )
         if source.kind in ("model", "splats"):
             given = [name for name in _PHOTO_SETTINGS if getattr(self.config, name) != getattr(MakeConfig, name)]
-            given += ["observer"] if self.observer is not None else []
+            given += ["observer"] if self.is_observed else []
             if given:
                 raise HyrfError(
                     f"{source.path}: this is no set of photos, but settings for photos were given",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from time import monotonic
@@ -135,6 +135,27 @@ def make_scene(
         >>> result.output.name, result.bytes > 0, sorted(path.name for path in result.work.iterdir())
         ('bonsai.html', True, ['export', 'make.json'])
     """
+    observing = None if observer is None else nullcontext(observer)
+    return make_observed_scene(
+        photos, output, config, work=work, overwrite=overwrite, observing=observing, context=context
+    )
+
+
+def make_observed_scene(
+    photos: StrPath,
+    output: StrPath,
+    config: MakeConfig | None = None,
+    *,
+    work: StrPath | None = None,
+    overwrite: bool = False,
+    observing: AbstractContextManager[Callable[[Trainer], None] | None] | None = None,
+    context: RunContext = RunContext(),  # noqa: B008 - frozen
+) -> MakeResult:
+    """Make a scene like `make_scene`, with an observer that exists during the work only.
+
+    `observing` is entered when all arguments are checked and yields the observer; None for none. The other arguments,
+    the result and the errors are those of `make_scene`.
+    """
     config = MakeConfig() if config is None else config
     check_type("config", config, MakeConfig)
     began, max_size = monotonic(), find_quality(config).max_size if config.max_size is None else config.max_size
@@ -149,15 +170,16 @@ def make_scene(
                 config=config,
                 device=context.choose_device(),
                 overwrite=overwrite,
-                observer=observer,
+                is_observed=observing is not None,
             )
             request.check()
             with (
                 exclusive_folder(request.work, "another folder with `work`"),
                 exclusive_folder(request.output) if request.makes_folder else nullcontext(),
+                observing or nullcontext() as observer,
             ):
                 with context.open_progress(interruptible=False) as progress:
-                    return _Pipeline(request, began, context, progress).run()
+                    return _Pipeline(request, observer, began, context, progress).run()
         except Stopped:
             raise
         except KeyboardInterrupt as error:  # interrupted before or between the stages
@@ -170,6 +192,7 @@ class _Pipeline:
     def __init__(
         self,
         request: Request,
+        observer: Callable[[Trainer], None] | None,
         began: float,
         context: RunContext,
         progress: Progress,
@@ -178,11 +201,13 @@ class _Pipeline:
 
         Args:
             request: the checked arguments of the call.
+            observer: observer of the training.
             began: start of the call by the monotonic clock, in seconds.
             context: context of the call.
             progress: function that gets the progress of all stages.
         """
         self.request = request
+        self.observer = observer
         self.source = request.source
         self.began = began
         self.reporter = Reporter(request.stages, progress, context.stop)
@@ -221,7 +246,7 @@ class _Pipeline:
         if request.config.minutes is None or "measurement" in stage_cache.kept:
             self.reporter.estimates |= estimate_scene_seconds(scene, plan, request.device)
         training = stages.run_training_stage(
-            stage_cache, scene, self._scene_digest(scene), plan, request.config.seed, request.observer, self.context
+            stage_cache, scene, self._scene_digest(scene), plan, request.config.seed, self.observer, self.context
         )
         remove_preview(stage_cache)
         if self.owns_cache:
@@ -244,9 +269,7 @@ class _Pipeline:
         if source.archive is not None:
             _LOG.info(f"{source.archive.name} was unpacked into {source.path} and is reused from there")
         config = PosesConfig(request.config.matching, request.config.seed)
-        return stages.run_pose_stage(
-            self.stage_cache, source.path, source.files(), config, request.observer, self.context
-        )
+        return stages.run_pose_stage(self.stage_cache, source.path, source.files(), config, self.observer, self.context)
 
     def _scene_digest(self, scene: Scene) -> str:
         """Return the digest of all files of a scene; for an archive, that of its unpacked files."""

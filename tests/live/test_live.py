@@ -12,12 +12,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from commands import refused, succeeded
+from commands import hyrfpack, refused, succeeded
+from explicit_balls import ball_splats
 from scenes import QUIET_CONTEXT, ball_scene
 
 from hyrfpack.format import decode_model, describe_file
 from hyrfpack.live import LiveView, live_view
 from hyrfpack.live.view import MIN_INTERVAL_RATIO, MIN_INTERVAL_SECONDS
+from hyrfpack.splats.formats import ply
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer, train_model
 
 TRAIN_CONFIG = TrainConfig(
@@ -212,6 +214,13 @@ def test_make_updates_the_live_view_with_the_option(data, observed_steps, monkey
     monkeypatch.setitem(plan.QUALITIES, "draft", quality)
     result = succeeded("make", data, "-o", tmp_path / "scene.hyrf", "--quality", "draft", "--view")
     assert observed_steps == [1, 2, 3] and "watch the training at http://127.0.0.1:" in result.stderr
+
+
+def test_make_announces_no_view_before_it_refuses_its_arguments(tmp_path):
+    (tmp_path / "ball.ply").write_bytes(ply.encode(ball_splats(9)))
+    result = hyrfpack("make", tmp_path / "ball.ply", "-o", tmp_path / "scene.html", "--view")
+    assert result.exit_code == 2
+    assert "leave out --view" in result.stderr and "http" not in result.stderr
 
 
 def test_a_port_that_is_taken_is_a_clear_error_before_any_work(data, tmp_path):
