@@ -19,7 +19,7 @@ from hyrfpack.data.equirectangular import CUBE_FACES, is_panorama
 from hyrfpack.data.folder import list_photos, list_pictures, list_raw_photos
 from hyrfpack.data.masks import MaskMatches
 from hyrfpack.data.unusable import raise_if_single_photo, raw_photos_notes, unreadable_sentences
-from hyrfpack.errors import HyrfDataError
+from hyrfpack.errors import HyrfDataError, suggest_command
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import StrPath
 from hyrfpack.poses import diagnosis
@@ -39,6 +39,7 @@ from hyrfpack.poses.prepare import (
 )
 from hyrfpack.poses.process import StageCrashedError, run_stage
 from hyrfpack.progress import Event, Progress, TaskEvent, part_of_progress
+from hyrfpack.splats.names import is_splats
 
 _LOG = logging.getLogger(__name__)
 
@@ -160,6 +161,7 @@ class _PoseEstimation:
         if is_archive(self.photos):
             self.photos = unpack(self.photos)
         self.output.check_paths(self.photos)
+        _raise_if_scene_file(self.photos)
         with exclusive_folder(self.out):
             self.output.check_replaceable(self.photos, self.overwrite)
             try:
@@ -456,3 +458,20 @@ class _PoseEstimation:
             shares = {name: rest * value for name, value in shares.items()} | {"photos": _VIDEO_FRAMES_TIME_RATIO}
         stages = list(shares)
         return sum(shares[earlier] for earlier in stages[: stages.index(stage)]), shares[stage]
+
+
+def _raise_if_scene_file(path: Path) -> None:
+    """Raise HyrfDataError if a path is a file of splats or a model, which would be taken for a video."""
+    if not path.is_file():
+        return
+    if path.suffix.lower() == ".hyrf":
+        raise HyrfDataError(
+            f"{path}: this is a model, not photos or a video",
+            fix=f"look at it with {suggest_command('view', path)}, or name photos",
+        )
+    if is_splats(path):
+        model = path.with_suffix(".hyrf").name
+        raise HyrfDataError(
+            f"{path}: this is a file of splats, not photos or a video",
+            fix=f"import it with {suggest_command('import', path, '-o', model)}, or name photos",
+        )

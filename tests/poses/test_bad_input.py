@@ -54,6 +54,21 @@ def test_a_single_photo_in_place_of_a_folder_is_a_clear_error(tmp_path):
     assert "name the folder of all photos" in refused("poses", photos / "00.png", "-o", tmp_path / "scene")
 
 
+@pytest.mark.parametrize(
+    ("name", "what", "command"),
+    [
+        ("a.ply", "a file of splats", "hyrfpack import"),
+        ("a.SPZ", "a file of splats", "hyrfpack import"),
+        ("a.hyrf", "a model", "hyrfpack view"),
+    ],
+)
+def test_splats_or_a_model_in_place_of_photos_are_a_clear_error(name, what, command, tmp_path):
+    (tmp_path / name).write_bytes(b"ply")
+    sentence = refused("poses", tmp_path / name, "-o", tmp_path / "scene")
+    assert f"{name}: this is {what}, not photos or a video" in sentence and command in sentence
+    assert "mp4" not in sentence and not (tmp_path / "scene").exists()
+
+
 def test_copies_of_one_photo_are_a_clear_error(tmp_path):
     photos = save_pictures(tmp_path / "photos", random_pictures(1) * 5)
     assert "4 of 5 files are copies of another" in refused("poses", photos, "-o", tmp_path / "scene")
