@@ -86,7 +86,7 @@ def make(
 
     torch_device = choose_command_device(device)
     try:
-        with notes_only_of("hyrfpack.make", "hyrfpack.poses", "hyrfpack.live", silent=("hyrfpack.imports",)):
+        with notes_only_of("hyrfpack.make", "hyrfpack.poses", "hyrfpack.live", silent=("hyrfpack.imports.run",)):
             result = make_observed_scene(
                 photos,
                 output,

@@ -147,3 +147,12 @@ def test_splats_of_other_programs_are_imported(tmp_path):
     assert list(result.seconds) == ["import", "export"] and result.export["import"]["gaussians_before"] == 40
     again = make_scene(tmp_path / "ball.ply", tmp_path / "scene.spz", MakeConfig(quality="draft"))
     assert again.kept == ("import",)
+
+
+@pytest.mark.usefixtures("quick_import")
+def test_the_command_warns_of_clamped_colours(tmp_path):
+    splats = ball_splats(40)
+    splats.harmonics[0, 0, 0] = 1e20
+    (tmp_path / "ball.ply").write_bytes(ply.encode(splats))
+    result = succeeded("make", tmp_path / "ball.ply", "-o", tmp_path / "scene.hyrf", "--quality", "draft")
+    assert "harmonics of 1 of 40 Gaussians are beyond 100,000" in result.stderr
