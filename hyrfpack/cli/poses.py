@@ -37,7 +37,7 @@ def poses(photos: Path, out: Path, masks: Path | None, overwrite: bool, as_json:
     """Estimate the poses of PHOTOS, a folder of photos, its .zip, or a video, and write a scene for 'hyrfpack train'.
 
     SCENE gets images/ (copies of the photos), sparse/0 (a COLMAP model) and poses.json (a report). PHOTOS may be SCENE
-    itself if its photos are in images/. Ctrl-C keeps finished stages, and the same command resumes.
+    itself; photos in its images/ stay as they are. Ctrl-C keeps finished stages, and the same command resumes.
 
     \b
     Examples:

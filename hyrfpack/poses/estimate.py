@@ -105,7 +105,7 @@ def estimate_poses(
     Args:
         photos: a folder of photos (each sub-folder is a camera of its own), a .zip of one, or a video.
         out: folder of the scene. It gets images/ (copies of the photos, turned upright), sparse/0 and poses.json. A
-            folder whose photos are in images/ may be both `photos` and `out`; its photos are not changed.
+            folder may be both `photos` and `out`; if its photos are in images/, they stay as they are.
         config: settings; None for the defaults.
         masks: folder of masks, named like the photos, black where a photo is ignored. None searches for masks/ in or
             beside the folder of photos.
