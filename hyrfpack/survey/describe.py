@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,7 +117,7 @@ def _describe(path: Path, report_progress: Progress) -> PhotoSurvey:
     report_progress(TaskEvent("reading poses", 0.0))
     scene, problems = _load_scene_or_problem(path, folder)
     posed = _posed_files(scene)
-    photos = sorted({*photos, *posed})
+    photos = _unite_photos(photos, posed)
     if not photos:
         raise no_photos_error(path, folder)
     facts, unreadable = read_header_facts(photos, folder, report_progress)
@@ -209,6 +210,22 @@ def _posed_files(scene: Scene | None) -> set[Path]:
     """Return the paths of the photos with poses."""
     files = (getattr(view.load, "path", None) for view in scene.views) if scene is not None else ()
     return {Path(file) for file in files if file is not None}
+
+
+def _unite_photos(photos: Iterable[Path], posed: Collection[Path]) -> list[Path]:
+    """Return the photos with poses, and those without in the same folders or below, each file under one path.
+
+    Other folders hold other versions of the photos, such as originals before undistortion.
+    """
+    if not posed:
+        return sorted(photos)
+    by_file = {os.path.realpath(photo): photo for photo in posed}
+    root = os.path.commonpath([os.path.dirname(file) for file in by_file])
+    for photo in photos:
+        file = os.path.realpath(photo)
+        if Path(file).is_relative_to(root):
+            by_file.setdefault(file, photo)
+    return sorted(by_file.values())
 
 
 def _describe_camera(fact: PhotoFacts) -> str:

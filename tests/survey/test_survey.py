@@ -187,6 +187,23 @@ def test_photos_without_a_pose_among_posed_ones_are_counted(data, tmp_path):
     assert "hyrfpack poses" in find_problem(survey, "3 of 13 photos have no pose")
 
 
+def test_a_photo_that_a_link_leads_to_is_counted_once(data, tmp_path):
+    shutil.copytree(data, tmp_path / "set")
+    (tmp_path / "set" / "images").rename(tmp_path / "set" / "photos")
+    (tmp_path / "set" / "images").symlink_to("photos")
+    survey = describe_photos(tmp_path / "set")
+    assert (survey.photos, survey.posed) == (10, 10)
+    assert all("copy" not in problem and "pose" not in problem for problem in survey.problems)
+
+
+def test_other_versions_of_posed_photos_are_not_counted(data, tmp_path):
+    shutil.copytree(data, tmp_path / "set")
+    shutil.copytree(data / "images", tmp_path / "set" / "input")
+    survey = describe_photos(tmp_path / "set")
+    assert (survey.photos, survey.posed) == (10, 10)
+    assert all("copy" not in problem and "pose" not in problem for problem in survey.problems)
+
+
 def test_damaged_photos_are_named_and_the_others_described(photos):
     (photos / "003.jpg").write_bytes(b"no picture")
     whole = (photos / "004.jpg").read_bytes()
