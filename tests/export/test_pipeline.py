@@ -283,6 +283,17 @@ def test_psnr_rises_with_the_degree_of_direction_dependent_colors(tmp_path):
     assert scores == sorted(scores) and scores[3] > scores[0] + 6
 
 
+@pytest.mark.parametrize(("radius", "warned"), [(200, False), (800, True)])
+def test_a_background_that_a_format_brings_near_is_a_warning(radius, warned, tmp_path, caplog):
+    frame = Frame((0.0, 0.0, 0.0), radius, (1.0, 1.0, 1.0))
+    model = small_model(GAUSSIAN_POSITIONS, fields=1.0, background=True, frame=frame)
+    cameras = [scale_and_move(camera, radius, (0, 0, 0)) for camera in FOUR_CAMERAS]
+    source = write_model(tmp_path / "a.hyrf", model, cameras)
+    for ending in (".spz", ".ply"):
+        export(source, tmp_path / f"a{ending}", degree=0)
+    assert caplog.text.count("so that the background is drawn at") == warned
+
+
 @pytest.mark.parametrize("ending", [".ply", ".spz", ".splat", ".sog"])
 def test_the_reported_psnr_is_measured_on_the_written_file(ending, plain_file, tmp_path):
     report = export(plain_file, tmp_path / f"a{ending}", degree=2)
