@@ -15,6 +15,7 @@ from hyrfpack.splats.placement import local_origin, upright_rotation
 _LOG = logging.getLogger(__name__)
 
 MESH_EXTENSIONS = ("glb", "ply", "obj", "stl")
+MAX_STEP_RATIO = 1e-5  # Coarser steps of a .stl, as a ratio of the mesh's size, are reported.
 _UNLIT_EXTENSION = "KHR_materials_unlit"  # colours of photos have the light in them already
 
 
@@ -26,7 +27,7 @@ def encode_mesh(mesh: Mesh, extension: str, up: np.ndarray) -> bytes:
     - A .ply has sRGB vertex colours, and float64 positions where float32 would be too coarse.
     - A .obj has sRGB vertex colours, if there are any, after the positions, which most programs read. Positions
       have as many digits as the mesh's size needs.
-    - A .stl has no colours, and float32 positions. A warning says if these are too coarse.
+    - A .stl has no colours, and float32 positions. A warning says if their steps are coarse, see MAX_STEP_RATIO.
 
     Args:
         mesh: the mesh.
@@ -48,8 +49,8 @@ def encode_mesh(mesh: Mesh, extension: str, up: np.ndarray) -> bytes:
         return _encode_ply(mesh, local if not origin.any() else mesh.vertices)
     if extension == "obj":
         return _encode_obj(mesh)
-    if origin.any():
-        step = np.spacing(np.abs(mesh.vertices).max().astype(np.float32))
+    step = np.spacing(np.abs(mesh.vertices).max(initial=0).astype(np.float32))
+    if step > MAX_STEP_RATIO * np.ptp(mesh.vertices, axis=0).max(initial=0):
         _LOG.warning(
             f".stl holds float32 positions, which far from the origin are multiples of {step:.2g} units: choose "
             "another format, or move the scene to the origin first"

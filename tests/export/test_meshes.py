@@ -73,7 +73,8 @@ def test_a_mesh_far_from_the_origin_keeps_its_shape(extension):
 
 
 def test_an_stl_far_from_the_origin_is_reported_as_coarse(caplog):
-    encode_mesh(TETRAHEDRON_MESH, "stl", UP)
+    for shift in (0, 50):  # at 50 units, the steps are 4e-6 units
+        encode_mesh(replace(TETRAHEDRON_MESH, vertices=TETRAHEDRON_MESH.vertices + shift), "stl", UP)
     assert not caplog.messages
     encode_mesh(replace(TETRAHEDRON_MESH, vertices=TETRAHEDRON_MESH.vertices + 5.3e6), "stl", UP)
     assert [message for message in caplog.messages if "multiples of 0.5 units: choose another format" in message]
