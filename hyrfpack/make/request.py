@@ -39,7 +39,7 @@ def default_work_folder(output: Path) -> Path:
 
 @dataclass(frozen=True)
 class Request:
-    """The arguments of `make`; the source is already inspected. An output ".." is replaced by its full path."""
+    """The arguments of `make`, with an inspected source. Outputs "." and ".." become full paths."""
 
     source: Source
     output: Path
@@ -51,7 +51,7 @@ class Request:
     is_observed: bool
 
     def __post_init__(self) -> None:
-        if self.output.name == "..":  # the product in the work folder gets the name of the output
+        if not self.output.name.strip("."):  # the product in the work folder gets the name of the output
             object.__setattr__(self, "output", Path(os.path.realpath(self.output)))
 
     @property

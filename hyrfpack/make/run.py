@@ -341,7 +341,9 @@ class _Pipeline:
         """Score the model, export it, and return the result."""
         request, stage_cache = self.request, self.stage_cache
         scores = {"views": 0} if scene is None else stages.run_scoring_stage(stage_cache, scene, request.device)
-        exported, product = stages.run_export_stage(stage_cache, model, request.output.name, scene)
+        exported, product = stages.run_export_stage(
+            stage_cache, model, request.output.name, scene, is_player=request.makes_folder
+        )
         output = stages.copy_to_output(
             product, request.output, overwrite=request.overwrite
         )  # last, so that an existing output means a finished call

@@ -16,6 +16,7 @@ import torch
 from hyrfpack.atomic import pending_file
 from hyrfpack.compress import compress_model
 from hyrfpack.config.compress import CompressConfig
+from hyrfpack.config.export import ExportConfig
 from hyrfpack.config.poses import PosesConfig
 from hyrfpack.context import RunContext
 from hyrfpack.copying import copy_file
@@ -268,9 +269,9 @@ def run_import_stage(
 
 
 def run_export_stage(
-    stage_cache: StageCache, model: Path, name: str, scene: Scene | None
+    stage_cache: StageCache, model: Path, name: str, scene: Scene | None, *, is_player: bool
 ) -> tuple[dict[str, Any], Path]:
-    """Export a model as `export/NAME`; return the report of the export and the path."""
+    """Export a model as `export/NAME`, a file or a player; return the report of the export and the path."""
     target = stage_cache.folder / EXPORT_FOLDER / name
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
@@ -279,7 +280,11 @@ def run_export_stage(
             report: dict[str, Any] = {"bytes": target.stat().st_size}
         else:
             context = RunContext(progress=stage_cache.reporter.report_event)
-            made = export_model(model, target, data=scene, context=context)
+            if is_player:  # a name with a dot names a player only if it is a folder
+                target.mkdir(parents=True, exist_ok=True)
+            # A player is named after its source by default, and that is model.hyrf in every work folder.
+            config = ExportConfig(title=name if is_player else None)
+            made = export_model(model, target, config, data=scene, context=context)
             report = {**asdict(made), "file": name, "chosen_by": {}}
         files = sorted(target.rglob("*")) if target.is_dir() else [target]
         return report, [path.relative_to(stage_cache.folder).as_posix() for path in files if path.is_file()]

@@ -76,6 +76,16 @@ def test_every_kind_of_output_is_written_without_repeating_other_stages(ending, 
     assert result.bytes == sum(path.stat().st_size for path in files) > 100
 
 
+@pytest.mark.parametrize("name", ["bonsai", "bonsai.v2"])
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_player_has_the_title_of_its_folder(name, inside, finished_work, tmp_path, monkeypatch):
+    (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path / name if inside else tmp_path)
+    make_scene(finished_work / "model.hyrf", "." if inside else name, work=tmp_path / "work")
+    assert f"<title>{name}</title>" in (tmp_path / name / "index.html").read_text()
+    assert (tmp_path / name / "README.txt").read_text().startswith(f"{name}\n")
+
+
 def test_poses_of_photos_without_poses_are_estimated(photos, poses, tmp_path):
     shares: list[StageEvent] = []
     result = make_scene(photos, tmp_path / "scene.hyrf", context=RunContext(progress=shares.append))
