@@ -62,8 +62,8 @@ def make(
     """Make a scene from PHOTOS: estimate poses if there are none, train, compress, score and export.
 
     PHOTOS is a folder or its .zip, a video, splats of another program (.ply .splat .spz .sog), or a .hyrf file.
-    The extension of FILE names the format: .hyrf, .html or any other that 'hyrfpack export' writes. A FILE without an
-    extension becomes a folder with a player.
+    The extension of FILE names the format: .hyrf, .html or any other that 'hyrfpack export' writes, except .json. A
+    FILE without an extension becomes a folder with a player.
 
     The results of each stage are kept. After an interruption (Ctrl-C, exit code 1), the same command resumes. If the
     training was interrupted, the scene so far is packed first.

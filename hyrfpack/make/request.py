@@ -12,9 +12,9 @@ from hyrfpack.config.export import ExportConfig
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.data.folder import list_photos
-from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.errors import HyrfDataError, HyrfError, suggest_command
 from hyrfpack.export.folder import check_folder
-from hyrfpack.export.kinds import PLAYER_FOLDER, check_place, check_request, find_file_kind
+from hyrfpack.export.kinds import PLAYER_FOLDER, TRANSFORMS_JSON, check_place, check_request, find_file_kind
 from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.make.source import LoadSettings, Source
 from hyrfpack.make.stages import EXPORT_FOLDER, PACKED_MODEL
@@ -95,7 +95,14 @@ class Request:
         """Reject options that exclude each other or do not fit the source."""
         source = self.source
         if not self._is_model:
-            check_request(find_file_kind(self.output, other_endings=(".hyrf",)), self.output, ExportConfig())
+            kind = find_file_kind(self.output, other_endings=(".hyrf",))
+            if kind is TRANSFORMS_JSON:  # its paths of photos would be relative to the work folder
+                raise HyrfError(
+                    f"{self.output}: this format holds only the cameras of the photos",
+                    fix="name another format; for the cameras of a finished model, use "
+                    f"{suggest_command('export', 'MODEL', '-o', self.output)} with `data`",
+                )
+            check_request(kind, self.output, ExportConfig())
         elif source.kind == "model":
             raise HyrfError(
                 f"{source.path}: this is a .hyrf file already", fix="make it smaller with 'hyrfpack compress'"

@@ -112,7 +112,8 @@ def make_scene(
     Args:
         photos: a folder of photos without poses, any path that `load_scene` reads, a video, a file of splats of
             another program (see `hyrfpack.import_splats`), or a `.hyrf` file to export.
-        output: path of the output, whose ending selects the format (".hyrf", or one of `hyrfpack.export_model`).
+        output: path of the output, whose ending selects the format (".hyrf", or one of `hyrfpack.export_model`, except
+            ".json").
         config: settings; None for the defaults.
         work: the work folder. None puts it beside the output, with the output's name and the ending ".work".
         overwrite: replace an existing output. Without it, an output that appears during the call is also kept. A file

@@ -348,6 +348,13 @@ def test_impossible_requests_are_rejected_before_any_work(posed, photos, finishe
     for sentence, *arguments in (
         ("no such file or folder", tmp_path / "nothing", "-o", out),
         ("the file extension does not name a known format", posed, "-o", tmp_path / "scene.xyz"),
+        (
+            f"only the cameras of the photos; name another format; for the cameras of a finished model, use 'hyrfpack "
+            f"export MODEL -o {tmp_path / 'cameras.json'}' with --data",
+            posed,
+            "-o",
+            tmp_path / "cameras.json",
+        ),
         ("there is a file of this name", posed, "-o", tmp_path / "there.html"),
         ("is a file, not a folder", posed, "-o", tmp_path / "there.html" / "scene.html"),
         ("reads what lies in this folder", photos, "-o", photos / "scene.html"),
