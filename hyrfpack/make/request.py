@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -75,9 +76,19 @@ class Request:
             for outputs in self.source.output_rules(overwrite=False):
                 self._check_output(outputs, overwrite=False)
 
-    def check_replacing(self, state: WorkFolderState) -> None:
-        """Check an existing output. Raises HyrfError: it was made by an earlier call and may not be replaced."""
+    def check_replacing(self, state: WorkFolderState, stage: str, inputs: dict[str, Any]) -> None:
+        """Check an existing output before a stage runs again with these inputs.
+
+        Raises:
+            HyrfError: an earlier call made the output, and it may not be replaced.
+        """
         if not self.overwrite and os.path.lexists(self.output) and self.is_output_unchanged(state):
+            if state.has_lost_files(stage, inputs):
+                raise HyrfError(
+                    f"{self.output}: an earlier call made this, but the result of its {stage} stage in {self.work} is "
+                    "missing or changed",
+                    fix="make it again with `overwrite=True`, or name another output",
+                )
             raise HyrfError(
                 f"{self.output}: an earlier call made this from another source or with other settings",
                 fix="name another, or replace it with `overwrite=True`",

@@ -55,8 +55,20 @@ class StageCache:
         seconds: time that each stage has taken in all calls together.
     """
 
-    def __init__(self, folder: Path, reporter: Reporter, check_replacing: Callable[[WorkFolderState], None]) -> None:
-        """Open the work folder; `check_replacing` is called before a stage runs, and raises HyrfError to prevent it."""
+    def __init__(
+        self,
+        folder: Path,
+        reporter: Reporter,
+        check_replacing: Callable[[WorkFolderState, str, dict[str, Any]], None],
+    ) -> None:
+        """Open the work folder.
+
+        Args:
+            folder: the work folder.
+            reporter: reports progress.
+            check_replacing: called with the record, the stage and its inputs before a stage runs; raises HyrfError to
+                prevent it.
+        """
         self.folder = folder
         self.state = WorkFolderState(folder)
         self.reporter = reporter
@@ -95,7 +107,7 @@ class StageCache:
             self.reporter.skip(name, self.seconds[name])
             _LOG.info(f"{name}: reused from an earlier run ({self.seconds[name]:.0f} s)")
             return facts
-        self._check_replacing(self.state)
+        self._check_replacing(self.state, name, inputs)
         resuming = self.state.was_begun(name, inputs)
         if not resuming:
             if reasons := self.state.changed_inputs(name, inputs):

@@ -81,6 +81,12 @@ class WorkFolderState:
             return None
         return record["facts"] if self._digest_files(record["files"]) == record["files"] else None
 
+    def has_lost_files(self, stage: str, inputs: dict[str, Any]) -> bool:
+        """Return whether a stage is finished with these inputs, but its files are missing or changed."""
+        record = self._stage_records.get(stage, {})
+        is_finished = "files" in record and record["inputs"] == _to_json_values(inputs)
+        return is_finished and self.facts(stage, inputs) is None
+
     def inputs(self, stage: str) -> dict[str, Any]:
         """Return the inputs with which a stage was begun."""
         return dict(self._stage_records[stage]["inputs"])

@@ -311,6 +311,38 @@ def test_a_repeated_call_keeps_everything_and_a_changed_output_needs_overwrite(f
     assert output.read_bytes() != before
 
 
+@pytest.mark.parametrize("name, stage", [("model.hyrf", "compression"), ("run", "training"), ("export", "export")])
+def test_an_output_whose_intermediate_results_are_missing_needs_overwrite(name, stage, posed, tmp_path):
+    output = tmp_path / "scene.hyrf"
+    work = make_scene(posed, output).work
+    (work / name).rename(tmp_path / "moved")
+    with pytest.raises(HyrfError, match=f"result of its {stage} stage in .* is missing .*`overwrite=True`"):
+        make_scene(posed, output)
+    assert stage not in make_scene(posed, output, overwrite=True).kept
+    assert len(make_scene(posed, output).kept) == 4
+
+
+def test_an_output_without_its_work_folder_needs_overwrite(posed, tmp_path):
+    shutil.rmtree(make_scene(posed, tmp_path / "scene.hyrf").work)
+    with pytest.raises(HyrfError, match="there is a file of this name; .*`overwrite=True`"):
+        make_scene(posed, tmp_path / "scene.hyrf")
+    assert make_scene(posed, tmp_path / "scene.hyrf", overwrite=True).kept == ()
+
+
+def test_settings_of_an_interrupted_call_do_not_count_as_missing_results(finished_work, posed, tmp_path, monkeypatch):
+    output, other = tmp_path / "scene.hyrf", MakeConfig(seed=3)
+    make_scene(posed, output, work=finished_work)
+
+    def stop(*arguments, **options):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(Stopped):
+        patch.setattr(stages, "train_model", stop)
+        make_scene(posed, output, other, work=finished_work, overwrite=True)
+    with pytest.raises(HyrfError, match="another source or with other settings"):
+        make_scene(posed, output, other, work=finished_work)
+
+
 @pytest.mark.parametrize("is_own", [True, False])
 def test_photos_are_dropped_before_compression_unless_the_caller_shares_the_cache(is_own, posed, tmp_path, monkeypatch):
     shared, cached_bytes = PictureCache(), []
