@@ -88,7 +88,8 @@ def export_player(
         editable: include a panel that crops, cleans, turns and measures the scene.
 
     Raises:
-        HyrfError: the file cannot be read, a file cannot be written, or another call is writing into the folder.
+        HyrfError: the file cannot be read, a file cannot be written, the photos do not belong to the model, or another
+            call is writing into the folder.
         TypeError: `data` is not a Scene.
 
     Example:
@@ -180,7 +181,8 @@ def export_gallery(
         editable: include a panel that crops, cleans, turns and measures a scene.
 
     Raises:
-        HyrfError: a file cannot be read or written, or another call is writing into the folder.
+        HyrfError: a file cannot be read or written, photos do not belong to their model, or another call is writing
+            into the folder.
         ValueError: the numbers of `data` and `sources` differ.
 
     Example:

@@ -96,8 +96,8 @@ def export_model(
         context: how progress is shown and the call is stopped.
 
     Raises:
-        HyrfError: a file cannot be read or written, the options contradict each other, or another call is writing into
-            the folder.
+        HyrfError: a file cannot be read or written, the options contradict each other, the photos do not belong to the
+            model, or another call is writing into the folder.
         TypeError: `data` is not a Scene.
 
     Example:

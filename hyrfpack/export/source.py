@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.capture import MISMATCH_REMEDY, Capture
 from hyrfpack.cameras.paths import Viewpoint, downward_direction, look_at, orbit
 from hyrfpack.cameras.view_sampling import interpolate_views
 from hyrfpack.errors import HyrfDataError, HyrfError
@@ -67,13 +67,16 @@ class Source:
         """Read a `.hyrf` file, with the cameras of the given photos or else those that the file keeps.
 
         Raises:
-            HyrfError: the file cannot be read or holds no Gaussian.
+            HyrfError: the file cannot be read or holds no Gaussian, or the photos do not belong to the model.
         """
-        facts, drawn = describe_file(path), load_model_or_parts(path)
+        facts = describe_file(path)
+        capture = Capture(facts, data)
+        if mismatch := capture.mismatch:
+            raise HyrfDataError(mismatch, fix=MISMATCH_REMEDY)
+        drawn = load_model_or_parts(path)
         model = scene_of(drawn)
         if not len(drawn):
             raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to export", fix="train it again")
-        capture = Capture(facts, data)
         try:
             viewpoint = capture.viewpoint
         except HyrfDataError as error:  # photos would not help, because the model's own viewpoint is needed

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from scenes import ball_scene, camera_at, ring, small_model
+from scenes import ball_scene, camera_at, photograph, ring, small_model, view_of
 
 import hyrfpack
 from hyrfpack.cameras.capture import provenance_cameras
@@ -237,12 +237,12 @@ def test_the_report_contains_the_loss_at_both_exposures(ending, bright_half_file
 
 
 def test_both_exposures_are_measured_on_photos(bright_half_file, tmp_path):
-    scene = ball_scene(4)
+    left, right = (view_of("0.png", camera, photograph(camera)) for camera in (LEFT_CAMERA, RIGHT_CAMERA))
     report = hyrfpack.export_model(
         bright_half_file,
         tmp_path / "a.ply",
         hyrfpack.ExportConfig(degree=0),
-        data=replace(scene, train=scene.train[1:], test=scene.train[:1]),
+        data=replace(ball_scene(2), train=[right], test=[left]),
     )
     assert list(report.photos_by_exposure) == ["local", "consistent"]
     assert report.photos_by_exposure["local"] == pytest.approx(report.photos_file, abs=0.01)

@@ -130,10 +130,10 @@ def test_a_poster_stays_below_its_size_limit(image_format, max_bytes):
 
 def test_a_file_without_cameras_is_viewed_from_an_orbit_or_from_its_photos(compact_file, tmp_path):
     export_model(compact_file, tmp_path / "a.html")
-    export_model(compact_file, tmp_path / "b.html", data=ball_scene(5))
+    export_model(compact_file, tmp_path / "b.html", data=ball_scene(10))
     made_up, photos = (extract_payload((tmp_path / name).read_bytes(), name)[0] for name in ("a.html", "b.html"))
-    assert len(made_up["cameras"]) == 12 and len(photos["cameras"]) == 5
-    assert np.allclose(photos["cameras"][0]["camera_from_world"], ball_scene(5).train[0].camera.camera_from_world)
+    assert len(made_up["cameras"]) == 12 and len(photos["cameras"]) == 10
+    assert np.allclose(photos["cameras"][0]["camera_from_world"], ball_scene(10).train[0].camera.camera_from_world)
 
 
 def test_an_uncompressed_file_is_embedded_with_a_note(model_file, compact_file, tmp_path, caplog):

@@ -11,6 +11,7 @@ from scenes import ball_scene, ring, small_model
 from hyrfpack.cameras.capture import provenance_cameras, quantized_provenance
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
+from hyrfpack.export import export_model
 from hyrfpack.export.source import MAX_MEASURED_VIEWS, MIN_CAMERAS_TO_HOLD_OUT, Source
 from hyrfpack.format import save_model
 from hyrfpack.scene import Camera, Scene
@@ -97,10 +98,19 @@ def test_without_cameras_rings_around_the_scene_are_used(provenance, write_model
 
 def test_photos_take_precedence_over_stored_cameras(write_model):
     scene = hold_out_every_fourth(ball_scene(12))
-    source = Source.read(write_model(ring_provenance(30)), scene)
+    source = Source.read(write_model(ring_provenance(24)), scene)  # every other one is that of a photo
     assert source.cameras == [(view.name, view.camera) for view in scene.train]
     assert source.fit_cameras == [view.camera for view in scene.train]
     assert source.measured_views == [(view.camera, view) for view in scene.test]
+
+
+@pytest.mark.parametrize("target", ["out.ply", "out.json", "out.html", "out"])
+def test_photos_in_another_frame_are_refused_before_any_work(target, write_model, tmp_path, monkeypatch):
+    path = write_model(ring_provenance(12))
+    monkeypatch.setattr("hyrfpack.export.source.load_model_or_parts", None)
+    with pytest.raises(HyrfError, match=r"balls: of the 12 cameras .* another coordinate frame; name the photos"):
+        export_model(path, tmp_path / target, data=ball_scene(12, offset=(5, 0, 0)))
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_the_number_of_scored_held_out_photos_is_limited(write_model):
