@@ -173,9 +173,10 @@ class Request:
         if self._is_model:
             outputs.file(self.output, ".hyrf")
         elif self.makes_folder:
-            outputs.folder(self.output, [])
             model = self.source.path if self.source.kind == "model" else self.work / PACKED_MODEL
+            # This comes first and names existing files of a player; to the other check its poster is a photo.
             check_folder(self.output, [model], [self.source.scene], overwrite=overwrite, is_gallery=False)
+            outputs.folder(self.output, [])
         else:
             check_place(self.output, outputs)
 

@@ -329,6 +329,18 @@ def test_an_output_without_its_work_folder_needs_overwrite(posed, tmp_path):
     assert make_scene(posed, tmp_path / "scene.hyrf", overwrite=True).kept == ()
 
 
+def test_a_changed_player_is_not_taken_for_photos(finished_work, posed, tmp_path):
+    player, photos = tmp_path / "player", tmp_path / "photos"
+    make_scene(posed, player, work=finished_work)
+    (player / "index.html").write_text("changed")
+    with pytest.raises(HyrfError, match=r"player: scene\.hyrf and \d more of the files to be written are there"):
+        make_scene(posed, player, work=finished_work)
+    assert (player / "index.html").read_text() == "changed"
+    shutil.copytree(posed / "images", photos)
+    with pytest.raises(HyrfError, match="photos or poses lie in this folder"):
+        make_scene(posed, photos, work=finished_work)
+
+
 def test_settings_of_an_interrupted_call_do_not_count_as_missing_results(finished_work, posed, tmp_path, monkeypatch):
     output, other = tmp_path / "scene.hyrf", MakeConfig(seed=3)
     make_scene(posed, output, work=finished_work)
