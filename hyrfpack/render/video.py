@@ -13,7 +13,9 @@ from hyrfpack.atomic import pending_file
 from hyrfpack.errors import HyrfError
 
 # Both sides must be even, because chroma is stored at half resolution; ffmpeg adds a black row or column if needed.
-_PAD_TO_EVEN_FILTER = "pad=ceil(iw/2)*2:ceil(ih/2)*2:0:0,format=yuv420p"
+# Players read videos of 720 rows and more with the matrix of BT.709. Without it, ffmpeg would use that of BT.601.
+_FILTER = "pad=ceil(iw/2)*2:ceil(ih/2)*2:0:0,scale=out_color_matrix=bt709:out_range=tv,format=yuv420p"
+_COLOR_TAGS = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "iec61966-2-1", "color_range": "tv"}
 
 
 def has_ffmpeg() -> bool:
@@ -51,7 +53,8 @@ def write_video(
         "-i",
         "-",
         "-vf",
-        _PAD_TO_EVEN_FILTER,
+        _FILTER,
+        *(word for name, value in _COLOR_TAGS.items() for word in (f"-{name}", value)),
         "-movflags",
         "+faststart",
         "-f",

@@ -13,7 +13,7 @@ from scenes import ball_points, ring, small_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.render import render_view
 from hyrfpack.render.files import render_files, save_picture, unique_stems
-from hyrfpack.render.video import write_video
+from hyrfpack.render.video import has_ffmpeg, write_video
 
 
 @pytest.mark.parametrize(
@@ -109,6 +109,27 @@ def test_without_overwrite_a_video_that_appears_meanwhile_is_kept(tmp_path, monk
     (tmp_path / "frame.png").write_bytes(b"frame")
     assert write_video([tmp_path / "frame.png"], video, overwrite=False) == tmp_path / "video-2.mp4"
     assert video.read_bytes() == b"foreign" and (tmp_path / "video-2.mp4").read_bytes() == b"frame"
+
+
+@pytest.mark.integration
+@pytest.mark.skipif(os.name == "nt", reason="needs executable scripts")
+def test_colours_of_videos_are_converted_and_tagged_alike(tmp_path, monkeypatch):
+    install_fake_ffmpeg(tmp_path, monkeypatch, "open(sys.argv[-1], 'w').write(' '.join(sys.argv))")
+    (tmp_path / "frame.png").write_bytes(b"frame")
+    words = write_video([tmp_path / "frame.png"], tmp_path / "video.mp4").read_text()
+    assert "out_color_matrix=bt709" in words and "-colorspace bt709" in words
+
+
+@pytest.mark.integration
+@pytest.mark.skipif(not has_ffmpeg(), reason="needs ffmpeg")
+def test_videos_show_the_colours_of_their_pictures(tmp_path):
+    av = pytest.importorskip("av")
+    colors = np.array([(200, 40, 40), (40, 180, 60), (50, 60, 200), (230, 200, 60)], np.uint8)
+    picture = colors.repeat(320, axis=0)[None].repeat(720, axis=0)
+    Image.fromarray(picture).save(tmp_path / "frame.png")
+    with av.open(str(write_video([tmp_path / "frame.png"] * 3, tmp_path / "video.mp4"))) as video:
+        shown = next(video.decode(video=0)).to_ndarray(format="rgb24")  # by the tags of the video
+    assert np.abs(shown[360, 160::320].astype(int) - colors).max() <= 3
 
 
 def test_a_video_without_ffmpeg_is_a_clear_error(tmp_path, monkeypatch):
