@@ -6,12 +6,17 @@ so that several processes need no other record.
 
 from __future__ import annotations
 
+import dataclasses
 import json
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hyrfpack.atomic import write_atomic
+from hyrfpack.blocks.cells import Cells
 from hyrfpack.blocks.plan import BlockPlan
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.errors import HyrfError, HyrfTrainingError
@@ -32,11 +37,13 @@ class Journal:
         path: its file, `blocks/blocks.json` in the folder of the run.
         settings: settings of the run by name. They and `photos` must be the same in a resumed run.
         photos: name, width and height of each photo of each block.
+        division: numbers that describe the cells, see `describe_cells`; None in journals of earlier versions.
     """
 
     path: Path
     settings: dict[str, Any]
     photos: dict[str, list]
+    division: list[float] | None = None
 
     def folder(self, block: str) -> Path:
         """Return the folder of the run of a block."""
@@ -58,6 +65,7 @@ class Journal:
         names = (CHECKPOINT_FILE, RECORD_FILE, METRICS_FILE, MODEL_FILE)
         remove_run_files(self.folder(block) / name for block in self.photos for name in names)
         content = {"version": JOURNAL_VERSION, "settings": self.settings, "photos": self.photos}
+        content["division"] = self.division
         write_atomic(self.path, json.dumps(content, indent=1).encode())
 
 
@@ -72,12 +80,14 @@ def open_journal(
     """
     path = out / BLOCKS_JOURNAL_FILE
     photos = {block.name: names_and_sizes(block.photos) for block in plan.blocks}
-    new = Journal(path, json.loads(json.dumps({"blocks": blocks, **config.to_dict()})), photos)
+    settings = json.loads(json.dumps({"blocks": blocks, **config.to_dict()}))
+    new = Journal(path, settings, photos, describe_cells(plan.cells))
     if resume:
         found = _read_journal(path)
         different = [name for name, value in new.settings.items() if found.settings.get(name) != value]
-        if different or found.photos != photos:
-            other = f"settings ({', '.join(different)})" if different else "photos"
+        if different or found.photos != photos or not _is_same_division(found.division, new.division):
+            other = "photos" if found.photos != photos else "poses or points"
+            other = f"settings ({', '.join(different)})" if different else other
             raise HyrfTrainingError(
                 f"{out}: the run was started with other {other}",
                 fix="resume with the same ones or train anew with `overwrite=True`",
@@ -86,6 +96,21 @@ def open_journal(
         hint = "`resume=True` continues it, " if is_begun(out) else ""
         raise HyrfError(f"{out}: the folder holds an earlier run", fix=f"{hint}`overwrite=True` replaces it")
     return new
+
+
+def describe_cells(cells: Cells) -> list[float]:
+    """Return the axes, borders and overlap of cells, which change with the poses and points of a scene."""
+    numbers = np.concatenate([np.ravel(part) for part in dataclasses.astuple(cells)])
+    return np.nan_to_num(numbers).tolist()  # outer borders are infinite
+
+
+def _is_same_division(found: Any, new: list[float] | None) -> bool:
+    """Return whether cells are the same, up to rounding; journals of earlier versions do not say."""
+    if found is None or new is None:
+        return True
+    with suppress(TypeError, ValueError):
+        return len(found) == len(new) and np.allclose(found, new, rtol=1e-6, atol=1e-9)
+    return False
 
 
 def is_begun(out: Path) -> bool:
@@ -107,6 +132,6 @@ def _read_journal(path: Path) -> Journal:
         content = json.loads(path.read_bytes())
         if content["version"] != JOURNAL_VERSION or not isinstance(content["settings"], dict):
             raise ValueError("it is of another version")
-        return Journal(path, content["settings"], content["photos"])
+        return Journal(path, content["settings"], content["photos"], content.get("division"))
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise HyrfTrainingError(f"{path}: the journal is damaged", fix="train anew with `overwrite=True`") from error

@@ -44,7 +44,7 @@ from hyrfpack.train.decisions import measures_budget, measures_exposure
 from hyrfpack.train.finish import TrainResult
 from hyrfpack.train.results import VIEWS_FOLDER, scene_facts
 from hyrfpack.train.run import Observer, resuming, train_model
-from hyrfpack.train.setup import budget_for, check_target
+from hyrfpack.train.setup import PACKED_HEADER_BYTES, budget_for, check_target
 
 _LOG = logging.getLogger(__name__)
 
@@ -268,7 +268,7 @@ class _BlockRun:
         """
         config, first = self.config, self.plan.blocks[0]
         if config.max_gaussians is not None or config.target_bytes is not None:
-            total, _ = budget_for(self.scene, config)
+            total, _ = budget_for(self.scene, self._with_bytes_of_one_block())
             budget = max(1, round(total * block.point_count / len(self.scene.points)))
             config = dataclasses.replace(config, max_gaussians=budget, target_bytes=None)
         if block is first:
@@ -286,6 +286,14 @@ class _BlockRun:
             return None
         config = dataclasses.replace(config, exposure=exposure)
         return config if config.max_gaussians is not None else dataclasses.replace(config, budget_factor=factor)
+
+    def _with_bytes_of_one_block(self) -> TrainConfig:
+        """Return the settings with a target size less the decoders and headers of all blocks but one."""
+        target = self.config.target_bytes
+        if target is None:
+            return self.config
+        rest = target - (len(self.plan.blocks) - 1) * PACKED_HEADER_BYTES
+        return dataclasses.replace(self.config, target_bytes=max(1, rest))
 
     def _read_metrics(self, block: Block) -> dict:
         """Read the metrics of a finished block."""

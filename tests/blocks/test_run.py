@@ -14,7 +14,7 @@ from layers import only_in_acceptance
 from rank_tasks import BLOCK_CONFIG, block_scene
 from scenes import QUIET_CONTEXT
 
-from hyrfpack.blocks import train_blocks
+from hyrfpack.blocks import run, train_blocks
 from hyrfpack.blocks.journal import Journal, is_begun
 from hyrfpack.blocks.plan import MIN_BLOCK_PHOTOS, plan_blocks
 from hyrfpack.blocks.run import BYTES_PER_BUDGETED_GAUSSIAN, choose_grid
@@ -27,8 +27,10 @@ from hyrfpack.model.merged import world_positions
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import StepEvent
 from hyrfpack.render import render_view
+from hyrfpack.scene import View
 from hyrfpack.train import load_training_scene, train_model
 from hyrfpack.train.results import RECORD_FILE
+from hyrfpack.train.setup import PACKED_BYTES_PER_GAUSSIAN, PACKED_HEADER_BYTES
 
 
 @pytest.fixture(scope="module")
@@ -168,6 +170,44 @@ def test_a_finished_run_is_neither_replaced_nor_resumed_with_other_settings(fini
     with pytest.raises(HyrfError, match="started with other photos"):
         train_blocks(fewer, out, BLOCK_CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
     assert result.model.read_bytes() == before
+
+
+def test_a_run_is_not_resumed_with_other_poses(finished):
+    out, result = finished
+    before, scene = result.model.read_bytes(), block_scene()
+
+    def twice_as_far(view: View) -> View:
+        pose = view.camera.camera_from_world.copy()
+        pose[:3, 3] *= 2
+        return dataclasses.replace(view, camera=dataclasses.replace(view.camera, camera_from_world=pose))
+
+    views = {name: [twice_as_far(view) for view in getattr(scene, name)] for name in ("train", "test")}
+    larger = dataclasses.replace(scene, points=2 * scene.points, **views)
+    with pytest.raises(HyrfError, match="started with other poses or points"):
+        train_blocks(larger, out, BLOCK_CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
+    assert result.model.read_bytes() == before
+
+
+def test_a_journal_of_an_earlier_version_is_resumed(finished, tmp_path):
+    shutil.copytree(finished[0], tmp_path / "run")
+    path = tmp_path / "run" / "blocks" / "blocks.json"
+    content = json.loads(path.read_text())
+    assert len(content.pop("division")) == 6 + 3 + 4 + 2
+    path.write_text(json.dumps(content))
+    resumed = train_blocks(block_scene(), tmp_path / "run", BLOCK_CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
+    assert resumed.model.read_bytes() == finished[1].model.read_bytes()
+
+
+def test_a_target_size_counts_the_decoders_of_each_block(monkeypatch, tmp_path):
+    budgets = []
+    monkeypatch.setattr(run, "train_model", lambda scene, out, config, **_: budgets.append(config.max_gaussians))
+    config = dataclasses.replace(BLOCK_CONFIG, max_gaussians=None, target_bytes=30_000)
+    scene = block_scene()
+    plan = plan_blocks(scene, 2, 1)
+    with pytest.raises(AttributeError):  # the replaced function returns nothing
+        train_blocks(scene, tmp_path / "run", config, "2x1", context=QUIET_CONTEXT)
+    all_gaussians = (30_000 - 2 * PACKED_HEADER_BYTES) / PACKED_BYTES_PER_GAUSSIAN
+    assert budgets == [round(all_gaussians * plan.blocks[0].point_count / len(scene.points))]
 
 
 def test_there_is_no_run_to_resume_in_an_empty_folder(tmp_path):
