@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from hyrfpack.scene import Camera, rigid_pose
 
 MAX_IMAGE_SIDE_PIXELS = 16384  # a larger number in a file is treated as a mistake
 INTRINSICS_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
+_FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:
@@ -92,8 +93,8 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
     - `cameras.json` of 3DGS training: also a list, with "position" (of the camera), "rotation" (3 x 3
       world_from_camera) and "img_name" in place of "camera_from_world" and "name";
     - `transforms.json` of nerfstudio and instant-ngp: an object with `frames`, each with a `transform_matrix`
-      (world_from_camera, OpenGL axes) and, here or for all frames, `w`, `h` and `fl_x` or `camera_angle_x`. Lens
-      distortion is left out: renders are pinhole pictures.
+      (world_from_camera, OpenGL axes) and, here or for all frames, `w`, `h` and a focal length, see `focal_entries` and
+      `focal_lengths`. Lens distortion is left out: renders are pinhole pictures.
 
     Raises:
         HyrfDataError: the file cannot be read, or a camera is incomplete or impossible; the message names the camera.
@@ -107,6 +108,7 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
         ) from error
     except (ValueError, RecursionError) as error:
         raise HyrfDataError(f"{path}: this is not JSON ({error})", fix="name a JSON file of cameras") from error
+    parse: Callable[[dict[str, Any], dict[str, Any], str], tuple[str, Camera]]
     if isinstance(content, dict) and isinstance(content.get("frames"), list):
         parse, items, shared = _parse_transforms_frame, content["frames"], content
     elif isinstance(content, list):
@@ -119,7 +121,7 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
     cameras = []
     for number, item in enumerate(items):
         try:
-            cameras.append(parse({**shared, **item}, f"{number:04d}"))
+            cameras.append(parse(dict(item), shared, f"{number:04d}"))
         except KeyError as error:
             raise HyrfDataError(f"{path}: camera {number} has no {error}", fix="add it") from error
         except (TypeError, ValueError, ArithmeticError) as error:
@@ -129,7 +131,7 @@ def cameras_from_json(path: str | os.PathLike[str]) -> list[tuple[str, Camera]]:
     return cameras
 
 
-def _parse_camera(item: dict[str, Any], name: str) -> tuple[str, Camera]:
+def _parse_camera(item: dict[str, Any], _: dict[str, Any], name: str) -> tuple[str, Camera]:
     """Parse a camera as `camera_to_json` writes it, or as 3DGS training does, by position and rotation."""
     if "camera_from_world" in item or "rotation" not in item:
         return str(item.get("name", name)), camera_from_json(item)
@@ -139,13 +141,44 @@ def _parse_camera(item: dict[str, Any], name: str) -> tuple[str, Camera]:
     return str(item.get("img_name", name)), camera_from_json({**item, "camera_from_world": rigid_pose(pose)})
 
 
-def _parse_transforms_frame(item: dict[str, Any], name: str) -> tuple[str, Camera]:
+def focal_entries(frame: Mapping[str, Any], shared: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a transforms.json that state a frame's focal lengths, without null.
+
+    They are the frame's own, then those for all frames. If the frame has a field of view, all are its own.
+    """
+    own, common = ({key: each[key] for key in _FOCAL_KEYS if each.get(key) is not None} for each in (frame, shared))
+    return own if own.keys() & {"camera_angle_x", "camera_angle_y"} else common | own
+
+
+def focal_lengths(entries: Mapping[str, float], from_angle: Callable[[str], float]) -> tuple[float, float] | None:
+    """Return fx and fy from `focal_entries`, None without any; one that is not stated equals the other.
+
+    Args:
+        entries: focal lengths in pixels (fl_x, fl_y) and fields of view in radians (camera_angle_x, camera_angle_y),
+            which count only without fl_x.
+        from_angle: returns the focal length for the field of view of a name.
+    """
+    fx, fy = entries.get("fl_x"), entries.get("fl_y")
+    if fy is None and fx is None and "camera_angle_y" in entries:
+        fy = from_angle("camera_angle_y")
+    if fx is None and "camera_angle_x" in entries:
+        fx = from_angle("camera_angle_x")
+    fx, fy = fy if fx is None else fx, fx if fy is None else fy
+    return None if fx is None or fy is None else (fx, fy)
+
+
+def _parse_transforms_frame(frame: dict[str, Any], shared: dict[str, Any], name: str) -> tuple[str, Camera]:
     """Parse a frame of a transforms.json, whose camera has OpenGL axes."""
-    width, height = item["w"], item["h"]
-    fx = item["fl_x"] if "fl_x" in item else width / (2 * math.tan(_finite_float(item["camera_angle_x"]) / 2))
+    item = shared | {key: value for key, value in frame.items() if value is not None}
+    sides = {"camera_angle_x": item["w"], "camera_angle_y": item["h"]}
+    entries = {key: _finite_float(value) for key, value in focal_entries(frame, shared).items()}
+    focal = focal_lengths(entries, lambda key: sides[key] / (2 * math.tan(entries[key] / 2)))
+    if focal is None:
+        raise KeyError("camera_angle_x")
     world_from_camera = rigid_pose(item["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
-    size = {"width": width, "height": height, "fx": fx, "fy": item.get("fl_y", fx)}
-    camera = camera_from_json({**item, **size, "camera_from_world": np.linalg.inv(world_from_camera)})
+    size = {"width": item["w"], "height": item["h"], "fx": focal[0], "fy": focal[1]}
+    given = {key: value for key, value in item.items() if value is not None}
+    camera = camera_from_json({**given, **size, "camera_from_world": np.linalg.inv(world_from_camera)})
     return str(item.get("file_path", name)), camera
 
 

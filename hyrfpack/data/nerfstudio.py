@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hyrfpack.cameras.files import focal_entries, focal_lengths
 from hyrfpack.data.assemble import Photo, make_scene, missing_photos_notes
 from hyrfpack.data.equirectangular import panorama_lens
 from hyrfpack.data.masks import find_mask_folder
@@ -191,33 +192,21 @@ def _check_scale_is_known(content: dict[str, Any], frame: dict[str, Any], file: 
 
 
 def _lens(content: dict[str, Any], frame: dict[str, Any], header: PictureHeader, file: Path) -> Lens:
-    """Return the lens of a frame, from the frame's own intrinsics or otherwise from those of the file.
-
-    If the frame states a field of view, both focal lengths are its own.
-    """
-    has_own_angle = any(frame.get(key) is not None for key in ("camera_angle_x", "camera_angle_y"))
+    """Return the lens of a frame, from the frame's own intrinsics or otherwise from those of the file."""
 
     def value(key: str) -> float | None:
         own = finite_number(frame, key, file)
         return own if own is not None else finite_number(content, key, file)
 
-    def focal_value(key: str) -> float | None:
-        return finite_number(frame, key, file) if has_own_angle else value(key)
-
     where = f"{file}: frame {frame['file_path'][:80]}"
     width, height = int(value("w") or header.width), int(value("h") or header.height)
-    fx, fy = focal_value("fl_x"), focal_value("fl_y")
-    angle_x, angle_y = focal_value("camera_angle_x"), focal_value("camera_angle_y")
-    if fx is None and angle_x is not None:
-        fx = focal_from_angle(angle_x, width, file, "camera_angle_x")
-    if fy is None:
-        fy = fx
-        if angle_y is not None and focal_value("fl_x") is None:
-            fy = focal_from_angle(angle_y, height, file, "camera_angle_y")
-    if fx is None:
-        fx = fy
-    if fx is None or fy is None:
+    stated = focal_entries(frame, content)
+    entries = {key: number for key in stated if (number := finite_number(stated, key, file)) is not None}
+    sides = {"camera_angle_x": width, "camera_angle_y": height}
+    focal = focal_lengths(entries, lambda key: focal_from_angle(entries[key], sides[key], file, key))
+    if focal is None:
         raise HyrfDataError(f"{where} has neither 'fl_x' nor 'camera_angle_x'", fix="add its focal length")
+    fx, fy = focal
     cx, cy = value("cx"), value("cy")
     pinhole = (width, height, fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from made_up_cameras import cameras
+from PIL import Image
 from scenes import ring
 
 from hyrfpack.cameras.files import (
@@ -87,6 +88,32 @@ def test_transforms_json_takes_the_angle_and_intrinsics_of_one_frame(tmp_path):
     assert first.intrinsics == pytest.approx((50, 50, 50, 25))
     np.testing.assert_array_equal(first.camera_from_world, np.diag([1.0, -1, -1, 1]))
     assert (second.width, second.intrinsics) == (60, (70, 71, 3, 4))
+
+
+@pytest.mark.parametrize(
+    ("shared", "own"),
+    [
+        ({"camera_angle_x": 1.0, "camera_angle_y": 0.5}, {}),
+        ({"fl_x": 24.0}, {"camera_angle_x": 0.5}),
+        ({"fl_x": 24.0, "fl_y": 25.0}, {"camera_angle_x": 0.5, "camera_angle_y": 0.6}),
+        ({"camera_angle_x": 1.0}, {"fl_x": 30.0}),
+        ({"fl_y": 30.0}, {}),
+        ({"fl_x": 24.0, "fl_y": None, "cx": None}, {"fl_x": None}),
+        ({"camera_angle_y": 0.5}, {}),
+    ],
+)
+def test_focal_lengths_are_those_of_the_scene_reader(shared, own, tmp_path):
+    from hyrfpack.data import load_scene
+
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (24, 16)).save(tmp_path / "images" / "a.png")
+    Image.new("RGB", (24, 16)).save(tmp_path / "images" / "b.png")
+    frames = [{"file_path": f"images/{name}.png", "transform_matrix": np.eye(4).tolist(), **own} for name in "ab"]
+    content = {"w": 24, "h": 16, **shared, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    (_, camera), _ = cameras_from_json(tmp_path / "transforms.json")
+    view = load_scene(tmp_path, test_every=0).views[0]
+    assert camera.intrinsics == pytest.approx(view.camera.intrinsics)
 
 
 def test_cameras_of_3dgs_training_are_converted(tmp_path):
