@@ -20,7 +20,7 @@ from hyrfpack.cli.common import (
     read_scene,
     scene_options,
 )
-from hyrfpack.cli.live import serve_training_view, view_options
+from hyrfpack.cli.live import check_view_options, serve_training_view, view_options
 from hyrfpack.cli.processes import processes_option
 from hyrfpack.cli.settings import reject_two_sizes, settings_options
 from hyrfpack.cli.types import INPUT_PATH, OUTPUT, OUTPUT_FOLDER
@@ -113,6 +113,7 @@ def train(
     if resume and overwrite:
         raise click.UsageError("--resume continues a run and --overwrite replaces it; give one of them")
     reject_two_sizes(**settings)
+    check_view_options(view, view_port)
     if poses and not ranks.is_single:
         raise click.UsageError(
             "--poses runs in one process only; run 'hyrfpack poses' first, then train from its folder"
@@ -151,7 +152,8 @@ def train(
     note(f"{scene.layout} scene: {photos} to train on, {len(scene.test)} held out; on {where}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20 // ranks.local_size)
     config, context = TrainConfig(**settings), RunContext(device=torch_device, ranks=ranks, cache=cache)
-    with serve_training_view(out.name, view and ranks.is_main, view_port) as observer:
+    shows = view and ranks.is_main
+    with serve_training_view(out.name, shows, view_port if shows else None) as observer:
         try:
             run = train_model if blocks is None else partial(train_blocks, blocks=blocks)
             result = run(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -133,6 +134,15 @@ def test_one_process_under_torchrun_gives_the_same_bytes_without_network_access(
 
 
 # -- two processes ---------------------------------------------------------------------------------------------------
+
+
+@needs_ranks
+def test_a_port_of_the_view_is_that_of_rank_0(data, logs, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    options = ("--steps", 4, "--max-gaussians", 50, "--view", "--view-port", port)
+    first = check_rank_0_speaks(run_command_on_ranks("train", data, "-o", tmp_path / "run", *options, folder=logs))
+    assert f"http://127.0.0.1:{port}/" in first.errors
 
 
 @pytest.mark.smoke

@@ -232,5 +232,5 @@ def test_a_port_that_is_taken_is_a_clear_error_before_any_work(data, tmp_path):
 
 
 def test_a_port_without_a_view_is_rejected(data, tmp_path):
-    for command in (("train", data, "-o", tmp_path / "run"), ("make", data, "-o", tmp_path / "scene.hyrf")):
+    for command in (("train", tmp_path, "-o", tmp_path / "run"), ("make", data, "-o", tmp_path / "scene.hyrf")):
         assert "give both of them" in refused(*command, "--view-port", 8000)
