@@ -22,7 +22,7 @@ const WORK_SLICE_MS = 12; // then the page can react and render a frame
 
 /**
  * Loads a file as an object in the file's world units, rotated so that up is +y. The object has one group in the
- * model's units, with the splats and, if the model has a background, its sphere.
+ * model's units, with the splats and, if the model has a background, its sphere. Merged files need `HyrfObject`.
  *
  * Colours are display-referred: render with `renderer.outputColorSpace = LinearSRGBColorSpace`, without tone mapping.
  *
@@ -124,7 +124,9 @@ function backgroundSphere(model) {
 }
 
 async function fetchBytes(address) {
-  const answer = await fetch(address);
+  const answer = await fetch(address).catch(() => {
+    throw new Error(`${address} cannot be fetched; check the address, and whether its server allows this page.`);
+  });
   if (!answer.ok) throw new Error(`${address} cannot be fetched (${answer.status}); check the address.`);
   return new Uint8Array(await answer.arrayBuffer());
 }

@@ -299,7 +299,7 @@ def _create_server(host: str, port: int, page: bytes, files: ServedFiles) -> _Se
         raise HyrfError(f"{port} is not a port", fix=f"name one from 1 to {MAX_PORT}, or 0 for any free one")
     try:
         server = Server((host, port), _Handler)
-    except (OSError, UnicodeError) as error:  # UnicodeError comes from a malformed host name
+    except (OSError, TypeError, UnicodeError) as error:  # a malformed host name gives the last two
         if getattr(error, "errno", None) == errno.EADDRINUSE:
             raise HyrfError(
                 f"port {port} of {host} is taken by another program",

@@ -304,7 +304,7 @@ def test_a_name_of_this_machine_that_the_user_gave_is_answered(monkeypatch: pyte
 # -- addresses that cannot be used -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("host", ["192.0.2.1", "no such name", "a" * 70])
+@pytest.mark.parametrize("host", ["192.0.2.1", "no such name", "a" * 70, "é..x"])
 def test_an_unusable_host_is_reported_in_one_sentence(host):
     with pytest.raises(HyrfError, match=rf"^nothing can listen at port 0 of {host} [^\n]*$"):
         serve(PAGE_HTML, host=host, open_browser=False, on_ready=lambda address: None)
