@@ -39,6 +39,7 @@ def test_a_path_in_a_folder_without_access_is_named_with_the_reason(words, tmp_p
     assert not Path("out").exists()
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize("words", COMMANDS.values(), ids=COMMANDS)
 def test_a_path_with_too_long_a_name_is_refused(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
