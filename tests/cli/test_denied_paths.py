@@ -8,7 +8,7 @@ import pytest
 from commands import refused
 from denied_access import deny_access
 
-COMMANDS = {
+WORDS_BY_COMMAND = {
     "info": ("info", "{}.ply"),
     "import": ("import", "{}.ply", "-o", "out.hyrf"),
     "cameras of an import": ("import", "splats.ply", "-o", "out.hyrf", "--cameras", "{}.json"),
@@ -25,7 +25,7 @@ COMMANDS = {
 }
 
 
-@pytest.mark.parametrize("words", COMMANDS.values(), ids=COMMANDS)
+@pytest.mark.parametrize("words", WORDS_BY_COMMAND.values(), ids=WORDS_BY_COMMAND)
 def test_a_path_in_a_folder_without_access_is_named_with_the_reason(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "private"
@@ -40,7 +40,7 @@ def test_a_path_in_a_folder_without_access_is_named_with_the_reason(words, tmp_p
 
 
 @pytest.mark.acceptance
-@pytest.mark.parametrize("words", COMMANDS.values(), ids=COMMANDS)
+@pytest.mark.parametrize("words", WORDS_BY_COMMAND.values(), ids=WORDS_BY_COMMAND)
 def test_a_path_with_too_long_a_name_is_refused(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "splats.ply").write_bytes(b"x")
