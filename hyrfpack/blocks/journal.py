@@ -83,11 +83,8 @@ def open_journal(
     settings = json.loads(json.dumps({"blocks": blocks, **config.to_dict()}))
     new = Journal(path, settings, photos, describe_cells(plan.cells))
     if resume:
-        found = _read_journal(path)
-        different = [name for name, value in new.settings.items() if found.settings.get(name) != value]
-        if different or found.photos != photos or not _is_same_division(found.division, new.division):
-            other = "photos" if found.photos != photos else "poses or points"
-            other = f"settings ({', '.join(different)})" if different else other
+        other = _describe_difference(_read_journal(path), new)
+        if other is not None:
             raise HyrfTrainingError(
                 f"{out}: the run was started with other {other}",
                 fix="resume with the same ones or train anew with `overwrite=True`",
@@ -98,18 +95,28 @@ def open_journal(
     return new
 
 
+def _describe_difference(old: Journal, new: Journal) -> str | None:
+    """Return in words what differs between the journal of a run and that of the call that resumes it, if anything."""
+    different = [name for name, value in new.settings.items() if old.settings.get(name) != value]
+    if different:
+        return f"settings ({', '.join(different)})"
+    if old.photos != new.photos:
+        return "photos"
+    return None if _is_same_division(old.division, new.division) else "poses or points"
+
+
 def describe_cells(cells: Cells) -> list[float]:
     """Return the axes, borders and overlap of cells, which change with the poses and points of a scene."""
     numbers = np.concatenate([np.ravel(part) for part in dataclasses.astuple(cells)])
     return np.nan_to_num(numbers).tolist()  # outer borders are infinite
 
 
-def _is_same_division(found: Any, new: list[float] | None) -> bool:
+def _is_same_division(old: Any, new: list[float] | None) -> bool:
     """Return whether cells are the same, up to rounding; journals of earlier versions do not say."""
-    if found is None or new is None:
+    if old is None or new is None:
         return True
     with suppress(TypeError, ValueError):
-        return len(found) == len(new) and np.allclose(found, new, rtol=1e-6, atol=1e-9)
+        return len(old) == len(new) and np.allclose(old, new, rtol=1e-6, atol=1e-9)
     return False
 
 

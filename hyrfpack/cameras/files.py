@@ -169,7 +169,7 @@ def focal_lengths(entries: Mapping[str, float], from_angle: Callable[[str], floa
 
 def _parse_transforms_frame(frame: dict[str, Any], shared: dict[str, Any], name: str) -> tuple[str, Camera]:
     """Parse a frame of a transforms.json, whose camera has OpenGL axes."""
-    item = shared | {key: value for key, value in frame.items() if value is not None}
+    item = {key: value for each in (shared, frame) for key, value in each.items() if value is not None}
     sides = {"camera_angle_x": item["w"], "camera_angle_y": item["h"]}
     entries = {key: _finite_float(value) for key, value in focal_entries(frame, shared).items()}
     focal = focal_lengths(entries, lambda key: sides[key] / (2 * math.tan(entries[key] / 2)))
@@ -177,8 +177,7 @@ def _parse_transforms_frame(frame: dict[str, Any], shared: dict[str, Any], name:
         raise KeyError("camera_angle_x")
     world_from_camera = rigid_pose(item["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
     size = {"width": item["w"], "height": item["h"], "fx": focal[0], "fy": focal[1]}
-    given = {key: value for key, value in item.items() if value is not None}
-    camera = camera_from_json({**given, **size, "camera_from_world": np.linalg.inv(world_from_camera)})
+    camera = camera_from_json({**item, **size, "camera_from_world": np.linalg.inv(world_from_camera)})
     return str(item.get("file_path", name)), camera
 
 
