@@ -127,7 +127,7 @@ class Packer:
                     break
                 distortion *= max(target_drop / psnr_drop, 1 / MAX_REFINING_RATIO)
                 _LOG.info(
-                    f"training photos lose {psnr_drop:.2f} dB, limit {target_drop:g} dB; encoding again at "
+                    f"training photos lose {psnr_drop:.2f} dB, target {target_drop:g} dB; encoding again at "
                     f"distortion {distortion:.2g}"
                 )
                 candidate = self.encode(distortion, encoding)
