@@ -78,6 +78,7 @@ def count_step_work(points: int, side: int, *, replayed: bool = False) -> WorkCo
             "hyrfpack.train.setup.HashGridConfig",
             lambda log2_table_size, **sizes: HashGridConfig(log2_table_size, **(sizes | {"levels": 2, "base": 2})),
         )
+        patch.setattr("hyrfpack.ops.hash_encode.gpu._POINTS_PER_THREAD", 1)
         trainer = Trainer(scene, config, device=gpu)
         if not replayed:
             trainer.replays_steps = False

@@ -36,8 +36,10 @@ TRAIN_CONFIG = TrainConfig(steps=3, max_gaussians=30, density=DENSITY_CONFIG, pr
 
 
 @pytest.fixture(autouse=True)
-def few_levels(monkeypatch):
-    """Models have 2 levels, because the interpreter is slow."""
+def quick_steps(monkeypatch):
+    """Models have 2 levels, and no runs of points are summed in their gradients, because the interpreter is slow."""
+    if not torch.cuda.is_available():
+        monkeypatch.setattr("hyrfpack.ops.hash_encode.gpu._POINTS_PER_THREAD", 1)
     monkeypatch.setattr(
         "hyrfpack.train.setup.HashGridConfig",
         lambda log2_table_size, **sizes: HashGridConfig(log2_table_size, levels=2, **sizes),

@@ -309,6 +309,7 @@ def test_estimates_of_no_gaussian_are_empty():
 def test_a_gpu_draws_signs_itself_and_accumulates_squares(monkeypatch):
     for name in ("MIN_SENSITIVITY_VIEWS", "MAX_SENSITIVITY_VIEWS"):
         monkeypatch.setattr(f"hyrfpack.compress.sensitivity.{name}", 4)
+    monkeypatch.setattr("hyrfpack.ops.hash_encode.gpu._POINTS_PER_THREAD", 1)  # the interpreter is slow
     model, cameras = ball_model(), ring(4, elevation=1.2, width=12, height=12)
     model.precision = "float32"
     expected = measure_sensitivity(model, cameras)

@@ -33,7 +33,7 @@ pytestmark = [
 
 SHORT_RUN_CONFIG = TrainConfig(
     steps=7,
-    max_gaussians=20,
+    max_gaussians=10,
     density=DensityConfig(start=1.0, stop=1.0, rounds=1),
     precision="float32",
     log2_table_size=5,
@@ -43,11 +43,12 @@ WITH_ROUNDS = DensityConfig(start=0.4, stop=1.0, rounds=1, gradient=1e-6, resets
 
 
 @pytest.fixture(autouse=True)
-def few_levels(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make models of 2 levels, because the interpreter is slow."""
+def quick_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make models of 1 level, and sum no runs of points in its gradient, because the interpreter is slow."""
+    monkeypatch.setattr("hyrfpack.ops.hash_encode.gpu._POINTS_PER_THREAD", 1)
     monkeypatch.setattr(
         "hyrfpack.train.setup.HashGridConfig",
-        lambda log2_table_size, **sizes: HashGridConfig(log2_table_size, levels=2, **sizes),
+        lambda log2_table_size, **sizes: HashGridConfig(log2_table_size, levels=1, **sizes),
     )
 
 
@@ -73,12 +74,12 @@ def replays(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def scene_of(change: str) -> Scene:
-    scene = ball_scene(views=2, points=20, side=10)
+    scene = ball_scene(views=2, points=10, side=8)
     views = list(scene.train)
     if "masks" in change:
         views = [dataclasses.replace(view, load=_masked(view.load())) for view in views]
     if change == "photos of two sizes":
-        views += ball_scene(views=2, points=20, side=12).train
+        views += ball_scene(views=2, points=10, side=10).train
         views = [dataclasses.replace(view, name=f"{number}.png") for number, view in enumerate(views)]
     return dataclasses.replace(scene, train=views, test=views[:1])
 
@@ -94,11 +95,11 @@ def config_of(change: str) -> TrainConfig:
         "masks, exposure compensation and a round of density control": {
             "exposure": True,
             "density": WITH_ROUNDS,
-            "max_gaussians": 30,
-            "steps": 6,
+            "max_gaussians": 15,
+            "steps": 5,
         },
         "random background colours": {"background": False, "background_color": "random"},
-        "rounds of density control": {"density": WITH_ROUNDS, "max_gaussians": 30},
+        "rounds of density control": {"density": WITH_ROUNDS, "max_gaussians": 15},
         "antialiasing": {"antialiased": True},
     }
     return dataclasses.replace(SHORT_RUN_CONFIG, **changes.get(change, {}))
