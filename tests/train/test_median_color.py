@@ -87,8 +87,8 @@ def on_wall(scene: Scene, level: int) -> Scene:
     return dataclasses.replace(scene, train=views, has_alpha=False)
 
 
-@pytest.mark.parametrize("level", [0, pytest.param(255, marks=pytest.mark.acceptance)])
-@pytest.mark.integration
+@pytest.mark.parametrize("level", [0, 255])
+@pytest.mark.acceptance
 def test_an_object_before_a_black_or_white_wall_is_learnt(level):
     """Fields that start at grey render nothing but the black wall after 20 steps, and never recover (16.5 dB)."""
     scene = on_wall(ball_scene(points=30, alpha=True), level)

@@ -44,6 +44,7 @@ def test_resuming_gives_the_bytes_of_the_uninterrupted_run(step, uninterrupted_t
     assert records_without_times(resumed.records) == records_without_times(uninterrupted_trainer.records)
 
 
+@pytest.mark.acceptance
 def test_resuming_again_and_again_gives_the_same_bytes(uninterrupted_trainer, tmp_path):
     path = tmp_path / "checkpoint.pt"
     stop_at(5, path)

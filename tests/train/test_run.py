@@ -38,8 +38,9 @@ RUN_CONFIG = TrainConfig(
     checkpoint_every=1,
     density=DensityConfig(start=0.05, stop=0.7, rounds=8, gradient=1e-5, resets=1),
 )
-# The same run in another process. "train" takes at least 0.05 s a step, so that the test can stop it early; "loop"
-# prints the number of each step.
+QUICK_CONFIG = dataclasses.replace(RUN_CONFIG, steps=24)
+# The run of RUN_CONFIG in another process. "train" takes at least 0.05 s a step, so that the test can stop it early;
+# "loop" prints the number of each step.
 CHILD_SCRIPT = """
 import json, sys, time
 from pathlib import Path
@@ -97,12 +98,12 @@ def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("runs") / "deep" / "balls"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.train.results.draw_training_curve", draw_training_curve)  # in place of a pixel
-        return out, train_model(split_scene(), out, RUN_CONFIG, context=QUIET_CONTEXT)
+        return out, train_model(split_scene(), out, QUICK_CONFIG, context=QUIET_CONTEXT)
 
 
 def test_a_run_leaves_model_metrics_curve_and_views(finished):
     out, result = finished
-    assert result.complete and result.step == 60 and result.model == out / "model.hyrf"
+    assert result.complete and result.step == 24 and result.model == out / "model.hyrf"
     assert {"model.hyrf", "metrics.json", "curve.png", "views"} == {entry.name for entry in out.iterdir()}
     assert list((out / "views").rglob("*.png"))
     with Image.open(out / "curve.png") as curve:
@@ -113,7 +114,7 @@ def test_a_run_leaves_model_metrics_curve_and_views(finished):
 def test_the_saved_model_is_the_trained_one(finished):
     """The bytes equal those of a trainer that has no held-out views."""
     _, result = finished
-    trainer = Trainer(split_scene(), RUN_CONFIG)
+    trainer = Trainer(split_scene(), QUICK_CONFIG)
     trainer.run()
     loaded = hyrf_format.load_model(result.model)
     assert parameter_bytes(loaded) == parameter_bytes(trainer.model)
@@ -124,9 +125,9 @@ def test_metrics_are_the_results_and_the_settings(finished):
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics == json.loads(json.dumps(result.metrics))
     assert metrics["bytes"] == result.model.stat().st_size
-    assert metrics["settings"]["steps"] == 60 and metrics["scene"]["train"] == 6 and metrics["scene"]["test"] == 2
+    assert metrics["settings"]["steps"] == 24 and metrics["scene"]["train"] == 6 and metrics["scene"]["test"] == 2
     assert metrics["gaussians"] == len(hyrf_format.load_model(result.model)) <= 120
-    assert [record["step"] for record in metrics["curve"]] == list(range(1, 61))
+    assert [record["step"] for record in metrics["curve"]] == list(range(1, 25))
 
 
 def test_the_evaluation_is_of_the_file_on_the_held_out_views(finished):
@@ -146,12 +147,12 @@ def test_a_folder_with_a_run_is_rejected_without_overwrite(finished):
     out, _ = finished
     before = (out / "model.hyrf").read_bytes()
     with pytest.raises(HyrfError, match="holds an earlier run.*`overwrite=True`"):
-        train_model(split_scene(), out, RUN_CONFIG, context=QUIET_CONTEXT)
+        train_model(split_scene(), out, QUICK_CONFIG, context=QUIET_CONTEXT)
     assert (out / "model.hyrf").read_bytes() == before
 
 
 def test_overwriting_replaces_the_run(tmp_path):
-    config = dataclasses.replace(RUN_CONFIG, steps=3)
+    config = dataclasses.replace(QUICK_CONFIG, steps=3)
     train_model(make_scene(), tmp_path, config, context=QUIET_CONTEXT)
     train_model(make_scene(), tmp_path, dataclasses.replace(config, seed=9), overwrite=True, context=QUIET_CONTEXT)
     assert json.loads((tmp_path / "metrics.json").read_text())["settings"]["seed"] == 9
@@ -161,7 +162,7 @@ def test_an_overwriting_run_that_ends_before_its_first_checkpoint_does_not_leave
     tmp_path, monkeypatch
 ):
     context = RunContext(progress=QUIET_CONTEXT.progress, stop=lambda: True)
-    train_model(make_scene(), tmp_path, RUN_CONFIG, context=context)
+    train_model(make_scene(), tmp_path, QUICK_CONFIG, context=context)
     assert (tmp_path / "checkpoint.pt").is_file()
 
     def fail(*arguments: object, **options: object) -> Trainer:
@@ -169,9 +170,9 @@ def test_an_overwriting_run_that_ends_before_its_first_checkpoint_does_not_leave
 
     monkeypatch.setattr("hyrfpack.train.run.Trainer", fail)
     with pytest.raises(HyrfError, match="the photos are gone"):
-        train_model(make_scene(), tmp_path, RUN_CONFIG, overwrite=True, context=QUIET_CONTEXT)
+        train_model(make_scene(), tmp_path, QUICK_CONFIG, overwrite=True, context=QUIET_CONTEXT)
     with pytest.raises(HyrfError, match="there is no checkpoint to resume"):
-        train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, context=QUIET_CONTEXT)
+        train_model(make_scene(), tmp_path, QUICK_CONFIG, resume=True, context=QUIET_CONTEXT)
 
 
 @pytest.mark.parametrize("name", ["training.json", "blocks/blocks.json", "checkpoint.pt"])
@@ -187,12 +188,12 @@ def test_a_file_of_an_earlier_run_that_cannot_be_removed_is_a_clear_error(tmp_pa
 
     monkeypatch.setattr(Path, "unlink", unlink)
     with pytest.raises(HyrfError, match=rf"{name}: .*earlier run cannot be removed \(Permission denied\); remove it"):
-        train_model(make_scene(), tmp_path, RUN_CONFIG, overwrite=True, context=QUIET_CONTEXT)
+        train_model(make_scene(), tmp_path, QUICK_CONFIG, overwrite=True, context=QUIET_CONTEXT)
 
 
 def test_a_file_at_the_name_of_the_folder_of_blocks_does_not_stop_an_overwriting_run(tmp_path):
     (tmp_path / "blocks").write_text("notes")
-    config = dataclasses.replace(RUN_CONFIG, steps=1)
+    config = dataclasses.replace(QUICK_CONFIG, steps=1)
     assert train_model(make_scene(), tmp_path, config, overwrite=True, context=QUIET_CONTEXT).complete
     assert (tmp_path / "blocks").read_text() == "notes"
 
@@ -200,19 +201,19 @@ def test_a_file_at_the_name_of_the_folder_of_blocks_does_not_stop_an_overwriting
 def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(HyrfError, match="file is a file, not a folder"):
-        train_model(make_scene(), tmp_path / "file" / "run", RUN_CONFIG, context=QUIET_CONTEXT)
+        train_model(make_scene(), tmp_path / "file" / "run", QUICK_CONFIG, context=QUIET_CONTEXT)
 
 
 def test_resuming_without_a_checkpoint_is_a_clear_error(tmp_path):
     with pytest.raises(HyrfError, match="no checkpoint to resume; leave out `resume=True`"):
-        train_model(make_scene(), tmp_path / "run", RUN_CONFIG, resume=True, context=QUIET_CONTEXT)
+        train_model(make_scene(), tmp_path / "run", QUICK_CONFIG, resume=True, context=QUIET_CONTEXT)
     assert not (tmp_path / "run").exists()
 
 
 def test_resuming_a_finished_run_says_that_its_model_is_there(tmp_path):
     (tmp_path / "model.hyrf").write_bytes(b"finished")
     with pytest.raises(HyrfError, match=r"only a finished model \(model.hyrf\); use this model"):
-        train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, context=QUIET_CONTEXT)
+        train_model(make_scene(), tmp_path, QUICK_CONFIG, resume=True, context=QUIET_CONTEXT)
     assert (tmp_path / "model.hyrf").read_bytes() == b"finished"
 
 
@@ -226,7 +227,7 @@ def test_the_trainer_is_freed_before_the_curve_is_drawn(tmp_path, monkeypatch):
         return path
 
     monkeypatch.setattr("hyrfpack.train.results.draw_training_curve", draw)
-    config = dataclasses.replace(RUN_CONFIG, steps=2)
+    config = dataclasses.replace(QUICK_CONFIG, steps=2)
     train_model(
         make_scene(),
         tmp_path,
@@ -243,7 +244,7 @@ def test_a_background_that_no_view_sees_is_dropped(tmp_path, opacity):
     wall = np.random.default_rng(0).normal(size=(500, 3))
     wall *= 4 / np.linalg.norm(wall, axis=1, keepdims=True)
     scene = dataclasses.replace(make_scene(), points=wall, point_colors=np.full((500, 3), 0.5, np.float32))
-    one_step = dataclasses.replace(RUN_CONFIG, steps=1, max_gaussians=500)
+    one_step = dataclasses.replace(QUICK_CONFIG, steps=1, max_gaussians=500)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("hyrfpack.train.setup.INITIAL_OPACITY", opacity)
         patch.setattr("hyrfpack.train.setup.MIN_INITIAL_SIZE", 0.45)
@@ -259,22 +260,22 @@ def test_a_background_that_no_view_sees_is_dropped(tmp_path, opacity):
 def test_the_speed_of_a_resumed_run_covers_all_its_parts(finished, tmp_path):
     _, result = finished
     assert 0 < sum(result.metrics["stage_seconds"].values()) <= 1.02 * result.metrics["seconds"] + 0.02
-    assert result.metrics["steps_per_second"] == pytest.approx(60 / result.metrics["seconds"])
+    assert result.metrics["steps_per_second"] == pytest.approx(24 / result.metrics["seconds"])
 
-    stopped = Trainer(make_scene(), RUN_CONFIG)
-    stopped.run(stop=lambda: stopped.step == 50)
+    stopped = Trainer(make_scene(), QUICK_CONFIG)
+    stopped.run(stop=lambda: stopped.step == 20)
     stopped.elapsed = 1e6
     stopped.save(tmp_path / "checkpoint.pt")
-    metrics = train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, context=QUIET_CONTEXT).metrics
+    metrics = train_model(make_scene(), tmp_path, QUICK_CONFIG, resume=True, context=QUIET_CONTEXT).metrics
 
     assert 1e6 < metrics["seconds"] < 1e6 + 600
-    assert metrics["steps_per_second"] == pytest.approx(60 / metrics["seconds"])
+    assert metrics["steps_per_second"] == pytest.approx(24 / metrics["seconds"])
 
 
 def test_a_long_run_logs_once_how_to_shorten_it(tmp_path, caplog, monkeypatch):
     for name in ("MIN_ADVICE_STEPS", "MIN_ADVICE_SECONDS", "MIN_ADVICE_SECONDS_LEFT"):
         monkeypatch.setattr(advice, name, 0)
-    train_model(make_scene(), tmp_path, dataclasses.replace(RUN_CONFIG, steps=8))
+    train_model(make_scene(), tmp_path, dataclasses.replace(QUICK_CONFIG, steps=8))
     (message,) = [message for message in caplog.messages if "hours remain" in message]
     assert all(way in message for way in ("fewer steps", "smaller photos", "fewer Gaussians", "a GPU"))
 
@@ -282,7 +283,7 @@ def test_a_long_run_logs_once_how_to_shorten_it(tmp_path, caplog, monkeypatch):
 def test_a_silent_run_logs_no_advice(tmp_path, caplog, monkeypatch):
     for name in ("MIN_ADVICE_STEPS", "MIN_ADVICE_SECONDS", "MIN_ADVICE_SECONDS_LEFT"):
         monkeypatch.setattr(advice, name, 0)
-    train_model(make_scene(), tmp_path, dataclasses.replace(RUN_CONFIG, steps=8), context=QUIET_CONTEXT)
+    train_model(make_scene(), tmp_path, dataclasses.replace(QUICK_CONFIG, steps=8), context=QUIET_CONTEXT)
     assert not [message for message in caplog.messages if "hours remain" in message]
 
 
@@ -344,17 +345,19 @@ def test_a_signal_at_any_line_of_the_handler_of_another_does_not_block():
         signal.signal(signal.SIGALRM, before)
 
 
-def test_a_stop_asked_by_the_context_saves_a_checkpoint_after_the_step(tmp_path, uninterrupted_trainer):
+def test_a_stop_asked_by_the_context_saves_a_checkpoint_after_the_step(tmp_path):
+    uninterrupted = Trainer(make_scene(), QUICK_CONFIG)
+    uninterrupted.run()
     steps: list[int] = []
     context = RunContext(
         progress=lambda event: steps.extend([event.step] if isinstance(event, StepEvent) else []),
-        stop=lambda: len(steps) >= 20,
+        stop=lambda: len(steps) >= 8,
     )
-    stopped = train_model(make_scene(), tmp_path, RUN_CONFIG, context=context)
-    assert (stopped.complete, stopped.step) == (False, 20) and (tmp_path / "checkpoint.pt").is_file()
-    resumed = train_model(make_scene(), tmp_path, RUN_CONFIG, resume=True, context=QUIET_CONTEXT)
+    stopped = train_model(make_scene(), tmp_path, QUICK_CONFIG, context=context)
+    assert (stopped.complete, stopped.step) == (False, 8) and (tmp_path / "checkpoint.pt").is_file()
+    resumed = train_model(make_scene(), tmp_path, QUICK_CONFIG, resume=True, context=QUIET_CONTEXT)
     loaded = hyrf_format.load_model(resumed.model)
-    assert parameter_bytes(loaded) == parameter_bytes(uninterrupted_trainer.model)
+    assert parameter_bytes(loaded) == parameter_bytes(uninterrupted.model)
 
 
 @pytest.mark.usefixtures("signals")
@@ -368,11 +371,9 @@ def test_a_signal_that_is_ignored_stays_ignored(number):
     assert signal.getsignal(number) is signal.SIG_IGN
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("signals")
-@pytest.mark.parametrize(
-    "number",
-    [STOP_SIGNALS[0], *(pytest.param(number, marks=pytest.mark.acceptance) for number in STOP_SIGNALS[1:])],
-)
+@pytest.mark.parametrize("number", STOP_SIGNALS)
 def test_an_interrupt_saves_exits_cleanly_and_resumes_to_the_same_model(number, uninterrupted_trainer, tmp_path):
     child = start_child(tmp_path, "train")
     checkpoint = tmp_path / "checkpoint.pt"

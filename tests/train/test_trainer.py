@@ -60,6 +60,7 @@ def test_the_same_seed_gives_the_same_bytes(uninterrupted_trainer):
     assert parameter_bytes(train_trainer()) == parameter_bytes(uninterrupted_trainer)
 
 
+@pytest.mark.acceptance
 def test_another_seed_gives_another_model(uninterrupted_trainer):
     other = train_trainer(dataclasses.replace(SHORT_CONFIG, seed=4))
     assert parameter_bytes(other) != parameter_bytes(uninterrupted_trainer)
