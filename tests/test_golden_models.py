@@ -26,11 +26,8 @@ MAX_TOTAL_BYTES = 300_000
 RECORDED_SIZES_FILE = TRAINED_FOLDER.parent / "trained_sizes.json"
 
 
-@pytest.mark.parametrize(
-    "golden_file",
-    [pytest.param(path, marks=[pytest.mark.acceptance] if path == DEMO_MODEL_FILE else []) for path in TRAIN_CONFIGS],
-    ids=lambda path: path.stem,
-)
+@pytest.mark.acceptance
+@pytest.mark.parametrize("golden_file", TRAIN_CONFIGS, ids=lambda path: path.stem)
 def test_a_new_training_reaches_the_quality_and_sizes_of_the_golden_model(golden_file, tmp_path):
     scene = make_golden_scene(golden_file, tmp_path / "photos")
 

@@ -29,6 +29,7 @@ from hyrfpack.ops.mlp import mlp
 from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
 from hyrfpack.render import RenderSettings, render_view
 
+pytestmark = pytest.mark.usefixtures("quick_calibration")
 RING_CAMERAS = ring(3, width=24, height=24)
 BENCH_DISTORTION = 1e-5
 
@@ -175,7 +176,7 @@ def test_quality_drops_are_differences_of_scores_by_evaluate():
 
 
 @pytest.fixture(scope="module")
-def coded_model() -> tuple[HybridModel, dict[str, dict]]:
+def coded_model(quick_calibration: None) -> tuple[HybridModel, dict[str, dict]]:
     """A model and the measurements of its coding. Tests must not change them."""
     model = make_model()
     return model, rows_by_setting(codec_rows(make_subject(model), 1, []))
@@ -283,7 +284,10 @@ def test_a_result_that_is_not_finite_stops_the_measurement():
 
 @pytest.mark.parametrize(
     ("measure", "module", "operation"),
-    [(hash_encode_rows, operation_calls, "hash_encode"), (render_rows, rendering, "render_view")],
+    [
+        (hash_encode_rows, operation_calls, "hash_encode"),
+        pytest.param(render_rows, rendering, "render_view", marks=pytest.mark.acceptance),
+    ],
 )
 def test_the_time_to_compile_kernels_is_not_measured(monkeypatch, measure, module, operation):
     now, compiled, run = [0.0], [], getattr(module, operation)

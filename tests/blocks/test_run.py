@@ -222,6 +222,7 @@ def test_an_error_names_the_block_and_says_how_to_continue(tmp_path):
         train_blocks(scene, tmp_path / "run", BLOCK_CONFIG, "2x1", context=QUIET_CONTEXT)
 
 
+@pytest.mark.acceptance
 def test_a_stop_before_the_first_step_can_be_resumed(finished, tmp_path):
     stopped = RunContext(progress=None, stop=lambda: True)
     first = train_blocks(block_scene(), tmp_path / "run", BLOCK_CONFIG, "2x1", context=stopped)

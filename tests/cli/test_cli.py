@@ -147,6 +147,7 @@ def test_compress_meets_a_target_size(tmp_path):
     assert f"of {target:,} bytes" in report["found"]
 
 
+@pytest.mark.acceptance
 def test_compress_can_fine_tune_and_keep_every_gaussian(run, data, tmp_path):
     arguments = ("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--data", data, "--json")
     report = json.loads(succeeded(*arguments, "--finetune", 3, "--no-prune").stdout)

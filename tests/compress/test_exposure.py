@@ -137,6 +137,7 @@ def test_finetuning_does_not_compensate_errors_of_the_map(model_file, scene, tmp
     assert abs(mean_log_gain_between(source, tmp_path / "fitted.hyrf", scene)) < 0.03
 
 
+@pytest.mark.acceptance
 def test_gains_are_fitted_once_per_search_and_only_with_learned_exposures(
     model_file, file_without_exposure_note, scene, tmp_path, monkeypatch
 ):

@@ -62,9 +62,8 @@ def source(model, tmp_path_factory) -> Path:
     [
         *(
             pytest.param(options, marks=pytest.mark.acceptance)
-            for options in ({}, {"distortion": 1e-5}, {"prune": False}, {"target_bytes": 6000})
+            for options in ({}, {"distortion": 1e-5}, {"prune": False}, {"target_bytes": 6000}, {"max_psnr_drop": 0.5})
         ),
-        {"max_psnr_drop": 0.5},
         {"finetune_steps": 3},
         {"profile": "paper"},
         {"profile": "raw"},
@@ -98,6 +97,7 @@ def test_the_error_is_measured_on_renders_as_photographed(model, source, scene, 
     assert errors[CONSISTENT_EXPOSURE] < errors["as-photographed"] / 1.25
 
 
+@pytest.mark.acceptance
 def test_fine_tuning_fits_renders_as_photographed_and_leaves_the_exposure_to_the_map(model, source, scene, tmp_path):
     compress_model(source, tmp_path / "tuned.hyrf", CompressConfig(finetune_steps=40), data=scene)
 

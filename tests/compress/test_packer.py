@@ -167,6 +167,7 @@ def test_finetuning_raises_the_psnr_at_the_same_size(demo_packer, finetuned_file
     assert fits[0] > fits[1] + 0.1
 
 
+@pytest.mark.acceptance
 def test_sizes_after_packing_and_export_match_the_recorded_ones(
     paper_file, compact_file_and_report, finetuned_file, tmp_path
 ):
@@ -208,12 +209,10 @@ def test_the_bytes_of_a_trained_model_do_not_depend_on_the_number_of_threads(
     assert (tmp_path / "small.hyrf").read_bytes() == compact_file_and_report[0].read_bytes()
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize(
     "limit",
-    [
-        pytest.param({"target_bytes": 9000}, id="size"),
-        pytest.param({"max_psnr_drop": 0.3}, id="loss", marks=pytest.mark.acceptance),
-    ],
+    [pytest.param({"target_bytes": 9000}, id="size"), pytest.param({"max_psnr_drop": 0.3}, id="loss")],
 )
 @pytest.mark.usefixtures("few_views")
 def test_finetuning_respects_limits(limit, scene, tmp_path):
@@ -488,6 +487,7 @@ def test_a_model_that_no_camera_sees_is_refused(tmp_path, scene, background):
     assert not (tmp_path / "small.hyrf").exists()
 
 
+@pytest.mark.usefixtures("few_views")
 def test_no_distortion_removes_every_gaussian(tmp_path):
     compress_model(DEMO_MODEL_FILE, tmp_path / "small.hyrf", CompressConfig(distortion=1.0))
     assert len(load_model(tmp_path / "small.hyrf")) >= 1

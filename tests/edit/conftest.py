@@ -19,3 +19,9 @@ def photos(tmp_path_factory) -> Path:
 @pytest.fixture(scope="package")
 def scene(photos) -> Scene:
     return load_scene(photos)
+
+
+@pytest.fixture(autouse=True)
+def quick_comparisons(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compare the pictures of an edit in two views."""
+    monkeypatch.setattr("hyrfpack.edit.run.MAX_COMPARED_VIEWS", 2)

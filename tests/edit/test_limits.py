@@ -26,6 +26,7 @@ COMPACT_FILE = DEMO_MODEL_FILE.with_name("demo_compact.hyrf")
 CENTER_BALL = CropSphere((0.0, 0.0, 0.0), 1.0)
 
 
+@pytest.mark.acceptance
 def test_an_edited_model_fills_a_target_size(tmp_path):
     free = edit_model(DEMO_MODEL_FILE, tmp_path / "free.hyrf", [CENTER_BALL], profile="compact", context=QUIET_CONTEXT)
     limits = EditLimits(target_bytes=free.bytes_after * 2 // 3)
@@ -45,10 +46,11 @@ def test_a_file_that_fits_already_is_copied(tmp_path):
     assert report.bytes_after == pytest.approx(COMPACT_FILE.stat().st_size, abs=100)
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize(
     "moves",
     [
-        pytest.param([], id="in place", marks=pytest.mark.acceptance),
+        pytest.param([], id="in place"),
         pytest.param([Scale(2.0), Translate((1.0, 2.0, 3.0))], id="moved"),
     ],
 )

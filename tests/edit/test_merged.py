@@ -259,6 +259,7 @@ def test_the_error_of_a_removal_is_that_of_the_merged_picture(merged):
     assert report.actions[0].gaussians_after == 70
 
 
+@pytest.mark.acceptance
 def test_all_parts_share_a_target_size(merged, tmp_path):
     free = edit_model(merged, tmp_path / "free.hyrf", [Scale(1.0)], profile="compact", context=QUIET_CONTEXT)
     limits = EditLimits(target_bytes=free.bytes_after * 4 // 5)

@@ -25,7 +25,7 @@ from hyrfpack.scene import View
 from tools.safety.train_golden import DEMO_MODEL_FILE
 
 CENTER_BALL = CropSphere((0.0, 0.0, 0.0), 1.0)
-STEPS, REPAIR_STEPS = 60, 150
+STEPS, REPAIR_STEPS = 60, 100
 
 
 @pytest.fixture(scope="module")

@@ -254,6 +254,7 @@ def test_a_model_without_a_map_reports_no_exposure(tmp_path):
     assert (report.exposure, report.psnr_by_exposure, report.photos_by_exposure) == (None, {}, {})
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("quick_scores")
 def test_a_file_without_cameras_gets_finite_splats(tmp_path):
     save_model(model_with_bright_half(), tmp_path / "bare.hyrf")

@@ -218,6 +218,7 @@ def test_the_report_measures_the_finest_level_as_written(content, exported):
     assert report.views > 0 and abs(report.psnr - report.psnr_baked) < {"gltf": 0.01, "spz": 1}[content]
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("quick_scores")
 def test_a_scene_of_parts_far_from_the_origin_keeps_its_precision(tmp_path):
     config = hyrfpack.ExportConfig(tiles_3d=True, tile_content="gltf", degree=0, background=False)

@@ -19,7 +19,7 @@ from hyrfpack.format.min_file_size import check_target_bytes, min_file_bytes, mi
 from hyrfpack.format.parts import encode_parts
 from hyrfpack.train import TrainConfig, train_model
 
-pytestmark = pytest.mark.integration
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("quick_calibration")]
 
 
 @pytest.fixture(scope="module")

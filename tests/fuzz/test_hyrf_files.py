@@ -192,7 +192,7 @@ def test_a_small_file_that_declares_a_huge_model_takes_little_memory(codec, kept
 
 def test_equal_gaussians_take_few_bytes_and_little_memory():
     """Equal symbols take no bytes in codecs 6 to 8; only the limit by the file's length bounds their number."""
-    count = 200_000
+    count = 60_000
     model = small_model(np.zeros((count, 3)))
     data = encode_model(model, "compact", quantized=quantize_uniformly(model, 0.01))
     assert len(data) < 5000

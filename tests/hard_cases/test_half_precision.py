@@ -155,7 +155,13 @@ def test_half_precision_preserves_backgrounds_at_any_distance(radius):
     assert -10 * torch.log10(((after - before) ** 2).mean()) > 56
 
 
-@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (1e6, -1e6, 5e5)], ids=["origin", "a million units away"])
+@pytest.mark.parametrize(
+    "offset",
+    [
+        pytest.param((0.0, 0.0, 0.0), id="origin", marks=pytest.mark.acceptance),
+        pytest.param((1e6, -1e6, 5e5), id="a million units away"),
+    ],
+)
 def test_half_precision_preserves_a_trained_scene_far_from_the_origin(offset):
     """In half precision, world coordinates would be infinite there."""
     trainer = Trainer(ball_scene(6, 60, side=24, offset=offset), TrainConfig(steps=60, max_gaussians=200))

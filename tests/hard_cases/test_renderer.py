@@ -116,6 +116,7 @@ def test_pictures_and_gradients_agree_with_float64(name: str) -> None:
         assert (gradient - wanted).norm() <= MAX_GRADIENT_ERROR_RATIO.get(name, 5e-5) * wanted.norm(), part
 
 
+@pytest.mark.acceptance
 @torch.no_grad()
 def test_a_picture_of_4096_by_64_agrees_with_float64() -> None:
     model, camera = _ball_model(40), _camera(CAMERA_POSITION, width=4096, height=64, focal=900.0)

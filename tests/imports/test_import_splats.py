@@ -60,6 +60,7 @@ def test_a_gallery_shows_the_psnr_of_an_import_only_if_the_import_aimed_at_one(t
     assert f"{psnr:.1f} dB against the splats it was made of<" in texts["psnr"] and " dB" not in texts["size"]
 
 
+@pytest.mark.acceptance
 def test_a_gallery_says_that_a_psnr_was_measured_before_compression(tmp_path: Path) -> None:
     imported, raw, small = (tmp_path / f"{name}.hyrf" for name in ("imported", "raw", "small"))
     import_loaded_splats(ball_splats(40), imported, replace(TINY_IMPORT_CONFIG, psnr=20.0))
@@ -128,7 +129,7 @@ def change_harmonic(splats: Splats, value: float) -> Splats:
     return replace(splats, harmonics=harmonics)
 
 
-@pytest.mark.parametrize("value", [1e20, -3e38])
+@pytest.mark.parametrize("value", [pytest.param(1e20, marks=pytest.mark.acceptance), -3e38])
 def test_a_huge_colour_is_clamped_with_a_warning(
     value: float, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -494,6 +494,7 @@ def test_a_scene_is_refused_as_a_source(folder, tmp_path):
     assert not (tmp_path / "scene").exists()
 
 
+@pytest.mark.acceptance
 def test_commands_read_a_scene_like_a_file(folder, tmp_path):
     info = json.loads(succeeded("info", folder, "--json").stdout)
     text = succeeded("info", folder / "scene.json").stdout

@@ -321,6 +321,7 @@ def test_the_command_line_writes_the_page_and_reports_it(model_file, tmp_path):
     assert ParsedReport(page).texts["pre"][0].startswith("hyrfpack ")
 
 
+@pytest.mark.acceptance
 def test_the_json_report_of_a_command_names_the_page(model_file, tmp_path):
     arguments = ("compress", model_file, "--profile", "raw", "--json")
     result = succeeded(*arguments, "-o", tmp_path / "p.hyrf", "--report", tmp_path / "page")
