@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import skimage.metrics
 import torch
+from layers import only_in_acceptance
 from PIL import Image
 from scenes import ball_points, ball_scene, small_model
 from scipy.ndimage import gaussian_filter
@@ -169,7 +170,7 @@ def lpips_network(name: str) -> ReferenceLPIPS:
     return ReferenceLPIPS(*(alexnet_layers() if name == "alex" else vgg_layers())).eval()
 
 
-@pytest.mark.parametrize("name", ["alex", "vgg"])
+@pytest.mark.parametrize("name", only_in_acceptance(["alex", "vgg"], ["vgg"]))
 def test_lpips_equals_the_straightforward_computation(name, tmp_path):
     network = lpips_network(name)
     torch.save(network.state_dict(), tmp_path / "weights.pt")
@@ -316,7 +317,7 @@ def test_comparison_hides_errors_under_the_mask():
     assert tuple(sheet[sheet.shape[0] // 2, -200]) == (0, 0, 4)
 
 
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (48, 48), (401, 3), (2000, 1500)])
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (48, 48), (401, 3), (1100, 700)])
 def test_comparison_takes_any_size(width, height):
     sheet = draw_comparison(torch.zeros(height, width, 3), torch.ones(height, width, 3), caption="a photo")
     assert 3 * 200 < sheet.width < 2100

@@ -18,6 +18,7 @@ from hyrfpack.config.make import MakeConfig
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.make import Stopped, first_look, make_scene
 
+pytestmark = pytest.mark.usefixtures("quick_calibration")
 ORIENTATION_TAG = 0x0112
 
 
@@ -34,6 +35,7 @@ def make(photos, tmp_path):
     return partial(make_scene, photos, tmp_path / "scene.hyrf", MakeConfig(quality="draft"), context=QUIET_CONTEXT)
 
 
+@pytest.mark.acceptance
 def test_an_observer_sees_a_first_look_before_the_training_and_gets_the_same_result(make, photos, poses, tmp_path):
     kinds, steps = [], []
 

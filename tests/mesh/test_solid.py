@@ -173,6 +173,7 @@ def test_narrow_gaps_are_filled_and_wide_ones_stay():
         assert mesh_of(proxy.vertices, proxy.faces).euler_number == 2 - 2 * genus
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("quick_distances")
 def test_small_parts_are_left_out():
     vertices, faces = sheet(1.0, 0.0125)

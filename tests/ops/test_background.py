@@ -291,7 +291,7 @@ def test_nodes_have_the_colours_at_their_pixel_centres() -> None:
 
 
 def test_the_reference_passes_gradcheck_for_the_field() -> None:
-    case = Case(height=4, width=5, hidden=(6, 5), levels=1, finest=4)
+    case = Case(height=3, width=4, hidden=(4, 3), levels=1, finest=4)
     arguments = case.arguments()
     parts = [arguments.pop("table"), *arguments.pop("weights"), *arguments.pop("biases")]
     inputs = [part.double().requires_grad_() for part in parts]

@@ -133,6 +133,7 @@ print(kept, resident_bytes() - before)
 """
 
 
+@pytest.mark.acceptance
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs glibc")
 def test_freed_memory_is_kept_for_the_block_only() -> None:
     result = subprocess.run([sys.executable, "-c", MEMORY_SCRIPT], capture_output=True, text=True, check=True)

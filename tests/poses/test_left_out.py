@@ -45,6 +45,7 @@ def test_the_other_photos_are_posed(report):
     assert (report.photos, report.registered) == (8, 5)
 
 
+@pytest.mark.acceptance
 def test_omitted_photos_are_named_by_the_users_files_and_not_by_internal_paths(report):
     assert set(report.left_out) == {"a.heic", "b.HEIC", "cut.tif"}
     assert report.left_out["a.heic"] == "reading HEIC photos needs pillow-heif"
@@ -52,6 +53,7 @@ def test_omitted_photos_are_named_by_the_users_files_and_not_by_internal_paths(r
     assert not any(".poses" in text or "/" in text for text in report.left_out.values())
 
 
+@pytest.mark.acceptance
 def test_each_kind_of_unusable_photo_is_counted_in_one_note(report):
     notes = "\n".join(report.notes)
     assert notes.count("2 of 8 photos cannot be read: a.heic, b.HEIC (reading HEIC photos needs pillow-heif)") == 1

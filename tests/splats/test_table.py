@@ -101,7 +101,7 @@ def test_the_docs_list_the_suffixes_of_the_table():
     }
 
 
-@pytest.mark.integration
+@pytest.mark.acceptance
 def test_the_table_imports_no_optional_packages():
     code = "import sys, hyrfpack.splats.table; print(*sorted({'pxr', 'trimesh', 'pycolmap'} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
