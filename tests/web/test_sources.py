@@ -272,8 +272,7 @@ ELEMENT_JS = "document.querySelector('hyrf-viewer')"
 ELEMENT_WINDOW_JS = f"{ELEMENT_JS}.shadowRoot.querySelector('iframe').contentWindow"
 
 
-@pytest.mark.smoke
-@pytest.mark.parametrize("kind", ["", ' type="module"'])
+@pytest.mark.parametrize("kind", [pytest.param("", marks=pytest.mark.smoke), ' type="module"'])
 def test_the_element_shows_a_file_and_follows_its_attributes(browser: Browser, host: Site, kind: str):
     host.files["/blog/post.html"] = (
         "<!DOCTYPE html><meta http-equiv=Content-Security-Policy content=\"style-src 'none'\">"

@@ -148,9 +148,10 @@ def test_a_map_with_a_wrong_checksum_is_refused():
     assert "checksum of section 'EXPO'" in verdict.refused
 
 
-def test_both_readers_refuse_the_same_damaged_maps():
+@pytest.mark.parametrize("count", [100, pytest.param(300, marks=pytest.mark.acceptance)])
+def test_both_readers_refuse_the_same_damaged_maps(count):
     rng, files = np.random.default_rng(2), []
-    for _ in range(300):
+    for _ in range(count):
         stored = bytearray(STORED_MAP)
         for place in rng.integers(0, len(stored), rng.integers(1, 4)):
             stored[place] = rng.integers(256)
@@ -160,5 +161,5 @@ def test_both_readers_refuse_the_same_damaged_maps():
 
     assert [
         find_disagreement(read_in_python(data), verdict) for data, verdict in zip(files, verdicts, strict=True)
-    ] == [""] * 300
+    ] == [""] * count
     assert {bool(verdict.refused) for verdict in verdicts} == {True, False}

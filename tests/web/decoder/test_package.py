@@ -8,6 +8,7 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import hyrfpack
 from hyrfpack.format import describe_file
@@ -135,6 +136,7 @@ def test_levels_are_chosen_by_one_limit():
     assert run_module(code, PACKAGE_FOLDER) == ["TypeError", "Give `gaussians` or `bytes`, not both."]
 
 
+@pytest.mark.acceptance
 def test_the_packed_and_installed_package_reads_a_file(npm, tmp_path):
     listed = subprocess.run(
         [npm, "pack", "--dry-run", "--json"], cwd=PACKAGE_FOLDER, capture_output=True, text=True, check=True

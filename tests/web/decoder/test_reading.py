@@ -108,7 +108,7 @@ def test_golden_files_decode_to_the_recorded_numbers():
 
 def test_random_configurations_decode_to_the_same_numbers():
     files = {}
-    for seed in range(12):
+    for seed in range(6):
         model = random_model(seed, (0, 1, 2, 7, 150, 400)[seed % 6])
         for profile in ("raw", "paper", "compact"):
             files[f"{profile} {seed}"] = encode(model, profile)
@@ -234,7 +234,7 @@ def layered_file() -> bytes:
 def test_truncated_files_are_read_or_refused_as_in_python(layered_file):
     entries = read_container(layered_file, SECTION_CONTENTS).entries.values()
     ends = {end + step for entry in entries for end in (entry.offset + entry.length, entry.end) for step in (-1, 0, 1)}
-    cuts = sorted({*range(0, len(layered_file), 37), *ends, len(layered_file)} - {len(layered_file) + 1})
+    cuts = sorted({*range(0, len(layered_file), 67), *ends, len(layered_file)} - {len(layered_file) + 1})
 
     accepted, refused = check_readers_agree({str(cut): layered_file[:cut] for cut in cuts}, cut=True)
 
@@ -570,7 +570,7 @@ def test_missing_layers_of_a_truncated_file_may_declare_any_size():
     assert check_readers_agree({"whole": data}) == ([], ["whole"])
 
 
-@pytest.mark.parametrize("count", [200, pytest.param(800, marks=pytest.mark.acceptance)])
+@pytest.mark.parametrize("count", [120, pytest.param(800, marks=pytest.mark.acceptance)])
 def test_hostile_files_get_the_same_verdict(count):
     tally = compare(range(100_000, 100_000 + count), seed=3)
 

@@ -84,6 +84,7 @@ def test_the_declarations_were_made_from_the_current_modules(compiler):
     assert stored == build_types(), "a module has changed: run 'make player'"
 
 
+@pytest.mark.acceptance
 def test_strict_typescript_compiles_a_program_of_a_user(error_lines):
     assert error_lines["user.ts"] == []
 
