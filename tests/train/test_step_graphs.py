@@ -77,15 +77,15 @@ def scene_of(change: str) -> Scene:
     scene = ball_scene(views=2, points=10, side=8)
     views = list(scene.train)
     if "masks" in change:
-        views = [dataclasses.replace(view, load=_masked(view.load())) for view in views]
+        views = [dataclasses.replace(view, load=_masked(view.load(), seed)) for seed, view in enumerate(views)]
     if change == "photos of two sizes":
         views += ball_scene(views=2, points=10, side=10).train
         views = [dataclasses.replace(view, name=f"{number}.png") for number, view in enumerate(views)]
     return dataclasses.replace(scene, train=views, test=views[:1])
 
 
-def _masked(picture: Picture) -> Callable[[], Picture]:
-    mask = np.random.default_rng(0).random(picture.rgb.shape[:2]) < 0.7
+def _masked(picture: Picture, seed: int) -> Callable[[], Picture]:
+    mask = np.random.default_rng(seed).random(picture.rgb.shape[:2]) < 0.7
     return lambda: Picture(picture.rgb, picture.alpha, mask)
 
 
