@@ -32,6 +32,19 @@ def test_tests_marked_gpu_are_run_and_a_failure_is_reported_with_its_reason(work
     assert "test_bad" in bad["note"] and "1 == 2" in bad["note"]
 
 
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_file_whose_tests_are_all_skipped_is_left_out_with_the_reason(workers: int, tmp_path: Path) -> None:
+    skipped = "import pytest\npytestmark = [pytest.mark.gpu, pytest.mark.skip('needs 20 GB: too few')]\n"
+    (tmp_path / "test_a.py").write_text(skipped + "def test_one(): pass\ndef test_two(): pass\n")
+    nothing_passed = list(gpu_suite.run_suite([str(tmp_path)], workers=workers))
+    (tmp_path / "test_b.py").write_text("import pytest\n@pytest.mark.gpu\ndef test_good(): pass\n")
+    left_out, good = sorted(gpu_suite.run_suite([str(tmp_path)], workers=workers), key=lambda row: str(row["case"]))
+    assert left_out["result"] == "2 skipped" and left_out["status"] == "left out"
+    assert left_out["note"] == "needs 20 GB: too few" and "status" not in good
+    assert nothing_passed[0]["status"] == "left out"
+    assert nothing_passed[1:] == [{"case": "pytest", "status": "failed", "note": "none of the 2 tests passed"}]
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

@@ -39,15 +39,17 @@ _OUTCOME_LABELS = {
     "XPASS": "xpassed",
 }
 _FAILED_OUTCOMES = ("FAILED", "ERROR")
+_SKIP_LINE = re.compile(r"SKIPPED \[\d+\] (?P<file>[^:]+\.py)(?::\d+)?: (?P<reason>.*)")  # of pytest's summary
 
 
 def run_suite(
     paths: Sequence[str], seconds: float = MAX_SECONDS, workers: int = MAX_TEST_PROCESSES, log: Path | None = None
 ) -> Iterator[Row]:
-    """Run the tests marked `gpu`; yield one row for each file, and one more if pytest failed outside of a test.
+    """Run the tests marked `gpu`; yield a row for each file, and one more if no test passed or pytest itself failed.
 
-    Rows are yielded at the end, or when `seconds` are over, with the first reason of each file's failures. Each test's
-    line is printed when the test ends, so the last line precedes a test that hangs.
+    A file whose tests were all skipped is left out. Rows are yielded at the end, or when `seconds` are over, with the
+    first reason of each file's failures. Each test's line is printed when the test ends, so the last line precedes a
+    test that hangs.
 
     Args:
         paths: files and folders of tests.
@@ -61,13 +63,13 @@ def run_suite(
     import pytest
 
     parallel = ("-n", str(workers), *PARALLEL_OPTIONS) if workers and find_spec("xdist") else ()
-    command = [sys.executable, "-m", "pytest", "-v", "--no-header", *PYTEST_OVERRIDES, *parallel]
+    command = [sys.executable, "-m", "pytest", "-v", "-rfEs", "--no-header", *PYTEST_OVERRIDES, *parallel]
     command += ["-m", GPU_MARKER, *paths]
     # The lines must be wide enough for the message of a failed test.
     environment = {**os.environ, "COLUMNS": "400", "PYTHONUNBUFFERED": "1"}
     process = TimedProcess(command, seconds, log, environment)
     counts: dict[str, Counter[str]] = {}
-    last_line, reasons = "", dict[str, str]()
+    last_line, reasons, skip_reasons = "", dict[str, str](), dict[str, str]()
     for line in process.lines():
         last_line = " ".join(line.split()) or last_line
         if test := next(filter(None, (pattern.fullmatch(line) for pattern in _TEST_LINES)), None):
@@ -75,20 +77,25 @@ def run_suite(
             counts.setdefault(test["file"], Counter())[test["outcome"]] += 1
         elif line.startswith(_FAILED_OUTCOMES):  # a line of pytest's summary
             reasons.setdefault(line.partition(" ")[2].partition("::")[0], last_line)
-    code = process.exit_code
+        elif skip := _SKIP_LINE.match(line):
+            skip_reasons.setdefault(skip["file"], skip["reason"])
+    code, tests = process.exit_code, sum(outcomes.total() for outcomes in counts.values())
     for file, outcomes in counts.items():
         row = _row(file, outcomes)
         if _has_failed(outcomes):
             row |= {"status": "failed", "note": reasons.get(file, last_line)}
+        elif set(outcomes) == {"SKIPPED"}:
+            row |= {"status": "left out", "note": skip_reasons.get(file, "all its tests were skipped")}
         yield row
     if code and process.is_out_of_time:
-        tests = sum(outcomes.total() for outcomes in counts.values())
         yield {"case": "pytest", "status": "failed", "note": f"not done within {seconds:.0f} s; {tests} tests were run"}
     elif not counts and code == pytest.ExitCode.NO_TESTS_COLLECTED:
         yield {"case": "pytest", "status": "failed", "note": f"no test is marked '{GPU_MARKER}' in {' '.join(paths)}"}
     elif code and not any(map(_has_failed, counts.values())):
         note = next(iter(reasons.values()), last_line)
         yield {"case": "pytest", "status": "failed", "note": f"pytest ended with exit code {code}: {note}"}
+    elif counts and not any(outcomes["PASSED"] or _has_failed(outcomes) for outcomes in counts.values()):
+        yield {"case": "pytest", "status": "failed", "note": f"none of the {tests} tests passed"}
 
 
 def _has_failed(outcomes: Counter[str]) -> bool:
