@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 
+from hyrfpack import train
 from hyrfpack.bench.operation_calls import OperationCall
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfError, needs_package
@@ -220,6 +221,33 @@ def test_errors_beyond_their_bounds_fail_a_row() -> None:
     assert row["status"] == "failed" and "beyond 1e-04" in row["note"]
 
 
+def test_wrong_gradients_fail_the_backward_row_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    def scale(implementation: str, x: torch.Tensor) -> torch.Tensor:
+        return x if implementation == "reference" else 2 * x - x.detach()  # right values, gradients of 2 in place of 1
+
+    call = OperationCall(scale, {"x": torch.linspace(1, 2, 5)}, ("x",), (1e-2, 1e-2))
+    monkeypatch.setattr(gpu_kernels, "median_ms", lambda *_: {"forward": 1.0, "backward": 1.0})
+    works = (gpu_roofline.Work(1.0, 1.0),) * 2
+    forward, backward = gpu_kernels._timed_rows("scale", "5 numbers", call, works, TINY_SETUP, call)
+    assert "status" not in forward and forward["value error"] == 0.0
+    assert backward["status"] == "failed" and backward["gradient error"] == 1.0
+
+
+@pytest.mark.parametrize("quantity", ["scales", "quats", "opacities"])
+def test_wrong_geometry_of_any_kind_fails_the_row_of_decoding(quantity: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = gpu_kernels._model(TINY_SETUP)
+    decode = type(model).decode_geometry
+
+    def decode_wrongly(self, index=None, used=None):
+        geometry = decode(self, index, used)
+        return replace(geometry, **{quantity: 2 * getattr(geometry, quantity)}) if self is model else geometry
+
+    monkeypatch.setattr(type(model), "decode_geometry", decode_wrongly)
+    geometry, radiance = gpu_kernels.decode_rows(TINY_SETUP)
+    assert geometry["status"] == "failed" and geometry["value error"] == pytest.approx(1.0, abs=0.01)
+    assert "status" not in radiance
+
+
 def test_numbers_that_are_not_finite_fail_a_row() -> None:
     call = OperationCall(lambda implementation, x: x if implementation == "reference" else x * float("nan"), {}, ())
     call = OperationCall(call.run, {"x": torch.ones(3)}, ("x",))
@@ -335,8 +363,8 @@ def test_the_page_has_goals_failures_and_a_table_for_each_kind(tmp_path: Path) -
         {"part": "frames", "item": "1", **goal_row("frames", 312.0, 300.0, "frames/s", at_least=True)},
         {"part": "frames", "item": "1", **goal_row("steps", 12.0, 10.0, "min", at_least=False)},
     ]
-    page = gpu_report.write_report(tmp_path / "new", {"device": "NVIDIA H200", "torch": "2.11"}, {"width": 1920}, rows)
-    assert page.name == "nvidia-h200.md"
+    page = tmp_path / "new" / "nvidia-h200.md"
+    gpu_report.write_report(page, {"device": "NVIDIA H200", "torch": "2.11"}, {"width": 1920}, rows)
     text = page.read_text()
     assert "# NVIDIA H200\n" in text and "torch 2.11" in text
     assert "| kernel | ms | pairs |\n| --- | --: | --: |\n| a\\|b | 0.5 | 1,234,567 |" in text
@@ -374,13 +402,38 @@ def test_it_starts_from_the_repository_root_without_an_installed_hyrfpack() -> N
 
 
 def test_the_default_parts_end_within_nine_minutes_and_leave_out_long_training() -> None:
-    assert sum(gpu_check.CHECK_PARTS[part][1] for part in gpu_check.DEFAULT_PARTS) <= 540
+    assert sum(gpu_check.CHECK_PARTS[part][1] for part in gpu_check.DEFAULT_PARTS) <= gpu_check.MAX_DEFAULT_SECONDS
     assert set(gpu_check.CHECK_PARTS) - set(gpu_check.DEFAULT_PARTS) == {"quality", "ranks", "full-run"}
 
 
 def test_rooms_of_the_goals_size_come_first_as_trained_before_tidy() -> None:
     assert gpu_frames.items(Setup())[:2] == ["1,000,000, as trained", "1,000,000"]
     assert sorted(gpu_frames.items(Setup())[2:]) == ["100,000", "3,000,000"]
+
+
+def test_a_check_of_some_parts_leaves_the_full_report_as_it_is() -> None:
+    names = [
+        gpu_check.report_path(Path("out"), "NVIDIA H200", parts).as_posix()
+        for parts in (gpu_check.DEFAULT_PARTS, gpu_check.DEFAULT_PARTS[::-1], ["ranks", "quality"], ["quality"])
+    ]
+    full = "out/nvidia-h200.md"
+    assert names == [full, full, "out/nvidia-h200-quality-ranks.md", "out/nvidia-h200-quality.md"]
+
+
+def test_the_probe_of_a_cpu_times_its_steps_without_the_set_up(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seconds = iter(range(100))
+    made = []
+
+    class SlowTrainer(train.Trainer):
+        def __init__(self, *arguments: object, **options: object) -> None:
+            super().__init__(*arguments, **options)
+            made.append(next(seconds))
+
+    monkeypatch.setattr(train, "Trainer", SlowTrainer)
+    monkeypatch.setattr(gpu_quality.time, "perf_counter", lambda: next(seconds))
+    monkeypatch.setattr(SlowTrainer, "run", lambda self: None)
+    _, row = gpu_quality._train(load_scene(data), 2, "float32", torch.device("cpu"))
+    assert made and row["seconds"] == 1
 
 
 def test_the_report_is_written_after_every_row(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -405,6 +458,7 @@ def test_different_bits_fail_a_row_unless_a_hash_table_was_added_to_in_any_order
 
 SANITIZER_OUTPUT = """========= COMPUTE-SANITIZER
 @begun mlp
+@done mlp
 {lines}========= {summary}
 """
 
@@ -426,9 +480,25 @@ SANITIZER_OUTPUT = """========= COMPUTE-SANITIZER
 def test_errors_that_the_sanitizer_counts_fail_its_row(
     lines: str, summary: str, found: str | None, note: str | None
 ) -> None:
-    row = gpu_sanitizer.describe_output(SANITIZER_OUTPUT.format(lines=lines, summary=summary), 1)
+    row = gpu_sanitizer.describe_output(SANITIZER_OUTPUT.format(lines=lines, summary=summary), 0, 1)
     assert found is None or str(row["found"]).startswith(found)
     assert ("status" in row) == (note is not None) and (note is None or note in str(row["note"]))
+
+
+@pytest.mark.parametrize(
+    ("output", "exit_code", "cases", "note"),
+    [
+        ("ModuleNotFoundError: No module named 'triton'\n", 1, 25, "exit code 1 after 0 of 25 cases"),
+        ("", 0, 2, "exit code 0 after 1 of 2 cases"),
+        ("", 1, 1, "exit code 1 after 1 of 1 cases"),
+    ],
+)
+def test_a_sanitizer_without_errors_fails_unless_all_cases_were_checked(
+    output: str, exit_code: int, cases: int, note: str
+) -> None:
+    output = output or "@begun mlp\n@done mlp\n"
+    row = gpu_sanitizer.describe_output(f"{output}========= ERROR SUMMARY: 0 errors\n", exit_code, cases)
+    assert row["found"] == "0 errors" and row["status"] == "failed" and note in str(row["note"])
 
 
 # Stands in for compute-sanitizer: it reports an error, ends one case of the self-test, and does not end by itself.

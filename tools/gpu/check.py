@@ -1,7 +1,7 @@
 """Check and measure hyrfpack's GPU kernels on this machine, and write a report; this takes at most 9 minutes.
 
     python -m tools.gpu.check                          the default parts; writes docs/gpu/<machine>.json and .md
-    python -m tools.gpu.check --parts tests kernels    only these parts
+    python -m tools.gpu.check --parts tests kernels    only these parts; writes <machine>-tests-kernels.json and .md
     python -m tools.gpu.check --parts quality --data ../shared/data/mipnerf360_bonsai
 
 It prints one line for each row of the report, and writes the report again after each row. It needs a GPU, torch with
@@ -41,7 +41,7 @@ import torch
 
 from hyrfpack.measure.machine import format_machine
 from hyrfpack.parallel.child_items import run_in_children
-from tools.gpu.report import describe_gpu_machine, write_report
+from tools.gpu.report import describe_gpu_machine, file_name, write_report
 from tools.gpu.rows import Row
 from tools.gpu.setup import FULL_RUN_SECONDS, Setup, find_dataset
 from tools.gpu.worker import failure_row, run_child
@@ -124,6 +124,16 @@ def run_child_items(part: str, setup: Setup, items: Sequence[str]) -> int:
     return run_child(lambda item: module.run(item, setup), items, lambda: _is_usable(setup.torch_device))
 
 
+def report_path(folder: Path, device: str, parts: Sequence[str]) -> Path:
+    """Return the page of a check, named by the machine and by its parts unless they are the default ones.
+
+    So a check of some parts leaves the machine's full report as it is.
+    """
+    chosen = [part for part in CHECK_PARTS if part in parts]
+    suffix = [] if chosen == list(DEFAULT_PARTS) else chosen
+    return folder / f"{'-'.join([file_name(device), *suffix])}.md"
+
+
 def main(arguments: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments[:1] == ["--worker"]:
@@ -158,12 +168,13 @@ def main(arguments: list[str] | None = None) -> int:
     setup = replace(setup, commit=str(facts["commit"]))
     print(format_machine(facts), flush=True)
 
-    def report(rows: Sequence[Row]) -> Path:
-        return write_report(args.out, facts, asdict(setup), rows)
+    page = report_path(args.out, str(facts["device"]), args.parts)
+
+    def report(rows: Sequence[Row]) -> None:
+        write_report(page, facts, asdict(setup), rows)
 
     report([])  # the machine's description remains even if the first part takes all the time
     rows = check(args.parts, setup, 3.0 if args.long else 1.0, report)
-    page = report(rows)
     failed = [row for row in rows if row.get("status") == "failed"]
     print(f"{page}: {len(rows)} rows, {len(failed)} failed")
     return 1 if failed else 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
 
@@ -11,13 +13,22 @@ from hyrfpack.measure.error import measure_relative_error
 
 
 def check_call(call: OperationCall, implementation: str) -> dict[str, object]:
-    """Return the error of a call's values and the largest error of its gradients as cells, with the row's status."""
+    """Return both errors of a call as cells, with the status of a row for both passes."""
+    forward, backward = check_passes(call, implementation)
+    return forward | backward
+
+
+def check_passes(call: OperationCall, implementation: str) -> tuple[dict[str, object], dict[str, object]]:
+    """Return a call's value error and its largest gradient error, each as the cells and status of a row of its own."""
     exact, exact_gradients = call.forward_backward_task("reference", torch.float64)()
     measured, gradients = call.forward_backward_task(implementation)()
-    values = relative_error(measured, exact)
-    worst = max((relative_error(a, b) for a, b in zip(gradients, exact_gradients, strict=True)), default=0.0)
-    row: dict[str, object] = {"value error": values, "gradient error": worst}
-    return row | status_beyond(values, call.error_bounds[0]) | status_beyond(worst, call.error_bounds[1])
+    value_error = relative_error(measured, exact)
+    gradient_error = largest_relative_error(gradients, exact_gradients)
+    value_bound, gradient_bound = call.error_bounds
+    return (
+        {"value error": value_error} | status_beyond(value_error, value_bound),
+        {"gradient error": gradient_error} | status_beyond(gradient_error, gradient_bound),
+    )
 
 
 def status_beyond(error: float, bound: float) -> dict[str, object]:
@@ -25,6 +36,11 @@ def status_beyond(error: float, bound: float) -> dict[str, object]:
     if error <= bound:
         return {}
     return {"status": "failed", "note": f"the error against the float64 reference is {error:.1e}, beyond {bound:.0e}"}
+
+
+def largest_relative_error(values: Iterable[Tensor], exact: Iterable[Tensor]) -> float:
+    """Return the largest of the relative errors of several tensors, each relative to its own size; 0 for none."""
+    return max((relative_error(a, b) for a, b in zip(values, exact, strict=True)), default=0.0)
 
 
 def relative_error(values: Tensor, exact: Tensor) -> float:

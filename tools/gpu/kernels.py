@@ -27,7 +27,7 @@ from hyrfpack.ops.shade import Shading, shade
 from hyrfpack.ops.viewport import Viewport
 from hyrfpack.render import RenderSettings
 from tools.gpu import roofline
-from tools.gpu.compare import check_call, relative_error, status_beyond
+from tools.gpu.compare import check_call, check_passes, largest_relative_error, relative_error, status_beyond
 from tools.gpu.roofline import Work
 from tools.gpu.rows import Row
 from tools.gpu.scene import (
@@ -148,23 +148,25 @@ def decode_rows(setup: Setup) -> Iterator[Row]:
     sample = _sample(torch.arange(len(model), device=setup.torch_device), setup)
     exact = copy.deepcopy(model).double()
     exact.precision = "float32"  # no factor of the reference's products is rounded to bfloat16
-    colors = (model.decode_colors(viewpoint, sample), exact.decode_colors(viewpoint.double(), sample))
-    geometry = [
-        torch.cat((part.scales, part.quats, part.opacities[:, None]), 1)
-        for part in (model.decode_geometry(sample), exact.decode_geometry(sample))
-    ]
+    errors = {
+        "geometry": largest_relative_error(
+            *(vars(decoder.decode_geometry(sample)).values() for decoder in (model, exact))
+        ),
+        "radiance": relative_error(
+            model.decode_colors(viewpoint, sample), exact.decode_colors(viewpoint.double(), sample)
+        ),
+    }
     tasks = {
         "geometry": lambda: model.decode_geometry(),
         "radiance": lambda: model.decode_colors(viewpoint),
     }
     times = median_ms(tasks, setup.repeats, setup.torch_device)
-    for (name, field), (values, reference) in zip(named_fields(model), (geometry, colors), strict=True):
+    for name, field in named_fields(model):
         widths = [field.weights[0].shape[1], *(weight.shape[0] for weight in field.weights)]
         mixed = model.precision == "mixed"
         work = roofline.count_decode(len(model), widths, field.grid.config.levels, field.grid.config.rows, mixed)
         row = _row(f"decode {name}", "forward", f"{len(model):,} Gaussians", times[name], work, setup)
-        error = relative_error(values, reference)
-        yield row | {"value error": error} | status_beyond(error, 1e-2)
+        yield row | {"value error": errors[name]} | status_beyond(errors[name], 1e-2)
 
 
 @torch.no_grad()
@@ -330,10 +332,10 @@ def _timed_rows(
     """Yield the rows of both passes of a call; the errors are those of `part`, a smaller call."""
     tasks = dict(zip(("forward", "backward"), call.separate_tasks(setup.implementation), strict=True))
     times = median_ms(tasks, setup.repeats, setup.torch_device)
-    errors = check_call(part, setup.implementation)
-    values, gradients = errors.pop("value error"), errors.pop("gradient error")
-    yield _row(name, "forward", size, times["forward"], works[0], setup) | {"value error": values} | errors
-    yield _row(name, "backward", size, times["backward"], works[1], setup) | {"gradient error": gradients} | errors
+    for (pass_name, ms), work, cells in zip(
+        times.items(), works, check_passes(part, setup.implementation), strict=True
+    ):
+        yield _row(name, pass_name, size, ms, work, setup) | cells
 
 
 def _row(name: str, pass_name: str, size: str, ms: float, work: Work, setup: Setup) -> Row:

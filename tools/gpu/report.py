@@ -71,14 +71,12 @@ def file_name(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
-def write_report(folder: Path, facts: dict[str, object], settings: dict[str, object], rows: Sequence[Row]) -> Path:
-    """Write `<machine>.json` and `<machine>.md` into a folder; return the path of the page."""
-    folder.mkdir(parents=True, exist_ok=True)
-    page = folder / f"{file_name(str(facts['device']))}.md"
+def write_report(page: Path, facts: dict[str, object], settings: dict[str, object], rows: Sequence[Row]) -> None:
+    """Write a page and, beside it, a JSON file of the same name."""
+    page.parent.mkdir(parents=True, exist_ok=True)
     content = {"machine": facts, "settings": settings, "rows": list(rows)}
     _replace_text(page.with_suffix(".json"), json.dumps(content, indent=1) + "\n")
     _replace_text(page, format_page(facts, rows))
-    return page
 
 
 def _replace_text(path: Path, text: str) -> None:

@@ -51,7 +51,7 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
         found = "; ".join(islice(_iterate_report_lines(output), 4))[:300]
         yield row | {"status": "failed", "note": f"not done within {TOOL_SECONDS[item]:.0f} s; it printed: {found}"}
     else:
-        yield row | describe_output(output, process.exit_code)
+        yield row | describe_output(output, process.exit_code, len(names))
 
 
 def product_operations() -> set[str]:
@@ -64,8 +64,8 @@ def count_checked_cases(output: str) -> int:
     return sum(line.startswith(DONE_PREFIX) for line in output.splitlines())
 
 
-def describe_output(output: str, exit_code: int) -> Row:
-    """Return the number of errors in a tool's output; the row has failed if there are any, or no summary."""
+def describe_output(output: str, exit_code: int, cases: int) -> Row:
+    """Return the number of errors in a tool's output, with a status if there are any or not all cases were checked."""
     summary = _SUMMARY.search(output)
     if summary is None:
         last_line = (output.strip().splitlines() or ["no output"])[-1]
@@ -73,6 +73,10 @@ def describe_output(output: str, exit_code: int) -> Row:
     row: Row = {"found": f"{summary[1]} {summary[2].strip()}"}
     if int(summary[1]):
         return row | {"status": "failed", "note": "; ".join(islice(_iterate_report_lines(output), 4))[:300]}
+    checked = count_checked_cases(output)
+    if exit_code or checked != cases:
+        note = f"it ended with exit code {exit_code} after {checked} of {cases} cases"
+        return row | {"status": "failed", "note": note}
     return row
 
 
