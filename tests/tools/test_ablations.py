@@ -16,7 +16,7 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.model.hash_grid import HashGrid
 from hyrfpack.render import render_view
 from hyrfpack.train import DensityConfig, LearningRates, TrainConfig, Trainer, setup
-from tools.studies import ablation_models, ablations
+from tools.studies import ablation_models, ablations, reuse
 
 # Density control clones and splits from the second step on.
 EARLY_DENSITY_CONFIG = DensityConfig(start=0.05, stop=0.7, rounds=5, gradient=1e-6)
@@ -254,6 +254,9 @@ def test_one_call_measures_the_variants_and_prints_their_tables(tmp_path, monkey
     ablations.main()
 
     assert capsys.readouterr().out == first
+    monkeypatch.setattr(reuse, "describe_own_version", lambda: "another")
+    with pytest.raises(TypeError):  # it would train again
+        ablations.main()
     for name in ("full", "spherical harmonics for colour", "no pre-culling"):
         assert f"| {name} | " in first
     assert "single field" not in first

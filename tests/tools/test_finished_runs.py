@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import pytest
 
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.errors import HyrfError
-from hyrfpack.train import TrainConfig
-from tools.studies import count_laws, processes
-from tools.studies.train_sets import has_run
+from tools.studies import count_laws, processes, reuse
 from tools.studies.trained_runs import load_runs
 
 
@@ -32,24 +30,6 @@ def test_a_set_with_runs_of_two_versions_is_refused(tmp_path):
         list(load_runs(tmp_path / "runs", tmp_path / "data"))
 
 
-@pytest.mark.parametrize(
-    ("change", "is_same"),
-    [({}, True), ({"steps": 9}, False), ({"seed": 1}, False), ({"exposure": True}, False), ({"exposure": None}, True)],
-)
-def test_a_run_is_reused_only_with_its_settings(change, is_same, tmp_path):
-    config = TrainConfig(steps=5, exposure=False)
-    assert not has_run(tmp_path, config)
-    (tmp_path / "metrics.json").write_text(json.dumps({"settings": config.to_dict(), "choices": {}}))
-    assert has_run(tmp_path, replace(config, **change)) == is_same
-
-
-@pytest.mark.parametrize(("choices", "steps", "is_same"), [({"steps": "7"}, 9, True), ({"steps": "7"}, 5, False)])
-def test_a_run_that_pilots_made_shorter_is_reused(choices, steps, is_same, tmp_path):
-    settings = TrainConfig(steps=7, exposure=False).to_dict()
-    (tmp_path / "metrics.json").write_text(json.dumps({"settings": settings, "choices": choices}))
-    assert has_run(tmp_path, TrainConfig(steps=steps)) == is_same
-
-
 def test_runs_of_other_steps_have_other_folders(tmp_path, monkeypatch):
     metrics = {"evaluation": {"psnr": 1, "ssim": 1}, "stage_seconds": {}, "gaussians": 1, "seconds": 1}
     folders = []
@@ -59,7 +39,7 @@ def test_runs_of_other_steps_have_other_folders(tmp_path, monkeypatch):
     assert len(set(folders)) == 2
 
 
-def test_counts_are_measured_again_for_other_steps_and_for_a_missing_lpips(tmp_path, monkeypatch, capsys):
+def test_counts_are_measured_again_for_other_steps_or_versions_and_for_a_missing_lpips(tmp_path, monkeypatch, capsys):
     calls = []
 
     def measure(data, size, count, steps, folder, lpips_weights):
@@ -70,8 +50,10 @@ def test_counts_are_measured_again_for_other_steps_and_for_a_missing_lpips(tmp_p
         (folder / count_laws.ROW_FILE).write_text(json.dumps(asdict(found)))
 
     monkeypatch.setattr(count_laws, "measure", measure)
-    for options in ([], [], ["--steps", "9"], ["--lpips-weights", "w.pth"], ["--lpips-weights", "w.pth"]):
+    lpips = ["--lpips-weights", "w.pth"]
+    for version, options in enumerate(([], [], ["--steps", "9"], lpips, lpips, lpips)):
+        monkeypatch.setattr(reuse, "describe_own_version", lambda version=version: "later" if version == 5 else "now")
         command = ["count_laws", "--sizes", "400", "--counts", "8", "16", "--out", str(tmp_path), *options]
         monkeypatch.setattr("sys.argv", command)
         count_laws.main()
-    assert calls == [(3000, False)] * 2 + [(9, False)] * 2 + [(3000, True)] * 2
+    assert calls == [(3000, False)] * 2 + [(9, False)] * 2 + [(3000, True)] * 4

@@ -10,7 +10,9 @@ from scenes import QUIET_CONTEXT, ball_scene
 
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.train import TrainResult
-from tools.studies import long_runs
+from tools.studies import long_runs, reuse
+from tools.studies.reuse import describe_origin, write_origin
+from tools.studies.train_sets import DATA_FOLDER
 
 
 @pytest.fixture
@@ -56,7 +58,6 @@ def test_a_stopped_run_resumes_from_its_checkpoint(run_tool, monkeypatch):
     def stop_once(scene, folder, config, *, resume, **options):
         resumed.append(resume)
         if len(resumed) == 1:
-            folder.mkdir(parents=True)
             (folder / "checkpoint.pt").touch()
             return TrainResult(False, 5, None, {})
         (folder / "checkpoint.pt").unlink(missing_ok=True)
@@ -67,6 +68,18 @@ def test_a_stopped_run_resumes_from_its_checkpoint(run_tool, monkeypatch):
         run_tool()
     run_tool()
     assert resumed == [False, True, False]
+
+
+def test_a_run_of_another_version_is_named_and_neither_repeated_nor_resumed(run_tool, tmp_path, monkeypatch):
+    run_tool()
+    (tmp_path / "40/seed0/ball/measured.json").unlink()
+    monkeypatch.setattr(reuse, "describe_own_version", lambda: "another")
+    monkeypatch.setattr(long_runs.hyrfpack, "train_model", None)
+    monkeypatch.setattr(long_runs, "load_variant", None)
+    printed = run_tool()
+    for steps in (20, 40):
+        assert f"{tmp_path}/{steps}/seed0/ball: this run is not one of the same version" in printed
+    assert printed.count("now another") == 2
 
 
 def test_a_finished_run_gets_the_fine_tuned_file_that_is_asked_for(run_tool, tmp_path, monkeypatch):
@@ -83,6 +96,7 @@ def test_a_finished_run_gets_the_fine_tuned_file_that_is_asked_for(run_tool, tmp
     for steps in (20, 40):
         folder = tmp_path / f"{steps}/seed0/ball"
         folder.mkdir(parents=True)
+        write_origin(folder, describe_origin(DATA_FOLDER / "ball", name="ball", steps=steps, seed=0, exposure=None))
         (folder / "measured.json").write_text(json.dumps(row | {"steps": steps, "steps_taken": steps}))
     assert "1,234" in run_tool("--finetune", "5") and tuned == [5, 5]
     assert "1,234" in run_tool("--finetune", "5") and tuned == [5, 5]

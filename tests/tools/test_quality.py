@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hyrfpack.errors import HyrfError
-from tools.studies.compare_versions import (
-    bytes_change_at_equal_psnr,
-    describe_version,
-    remove_outdated,
-    score_gain_at_equal_bytes,
-)
+from tools.studies import compare_versions, reuse
+from tools.studies.compare_versions import bytes_change_at_equal_psnr, score_gain_at_equal_bytes
 
 FILE_SIZES = np.array([1e5, 2e5, 4e5, 8e5])
 
@@ -63,52 +59,68 @@ def test_scores_are_compared_at_the_most_bytes_that_both_have():
     assert score_gain_at_equal_bytes(make_curve(4 * FILE_SIZES, -0.2), make_curve(FILE_SIZES)) == pytest.approx(-0.2)
 
 
-def run_git(folder: Path, *words: str) -> None:
-    author = ["-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "commit.gpgsign=false"]
-    subprocess.run(["git", *author, *words], cwd=folder, check=True, capture_output=True)
+@pytest.fixture
+def scored_commands(monkeypatch, tmp_path):
+    """The commands that `train_and_score` runs, of which none is executed."""
+    commands = []
+
+    def run(version, command, *arguments):
+        commands.append((version, command, arguments))
+        out = Path(arguments[arguments.index("-o") + 1])
+        if command == "train":
+            out.mkdir(parents=True, exist_ok=True)
+            (out / "metrics.json").write_text('{"gaussians": 9}')
+        (out / "compact.hyrf" if command == "train" else out).touch()
+
+    monkeypatch.setattr(compare_versions, "_run_command", run)
+    monkeypatch.setattr(compare_versions, "describe_version", lambda folder: folder.name)
+    monkeypatch.setattr(compare_versions.hyrfpack, "load_model", lambda path: None)
+    monkeypatch.setattr(
+        compare_versions.hyrfpack, "evaluate_model", lambda model, views: SimpleNamespace(psnr=20.0, ssim=0.5)
+    )
+    compare_versions.compile_kernels.cache_clear()
+    return commands
 
 
-def test_a_version_is_a_commit_with_its_changes(tmp_path: Path):
-    run_git(tmp_path, "init")
-    names = []
-    for text in ("first", "second", "third"):
-        (tmp_path / "file").write_text(text)
-        names += [describe_version(tmp_path)] if names else []
-        run_git(tmp_path, "add", "file")
-        run_git(tmp_path, "commit", "-m", text)
-        names.append(describe_version(tmp_path))
-    (tmp_path / "file").write_text("fourth")
-    names.append(describe_version(tmp_path))
-    (tmp_path / "file").write_text("fifth")
-    names.append(describe_version(tmp_path))
-    assert len(set(names)) == len(names) == 7
-    assert [("-dirty" in name) for name in names] == [False, True, False, True, False, True, True]
+def test_scores_are_reused_only_for_the_same_data_set_and_version(scored_commands, tmp_path, monkeypatch):
+    def trained(data: str, version: str = "a") -> bool:
+        scored_commands.clear()
+        scene = SimpleNamespace(path=Path(data), test=[])
+        compare_versions.train_and_score(Path(version), scene, 100, None, 0, tmp_path / "out")
+        return any(command == "train" for _, command, _ in scored_commands)
+
+    assert [trained("x/demo"), trained("x/demo"), trained("y/demo"), trained("y/demo", "b")] == [
+        True,
+        False,
+        True,
+        True,
+    ]
+    monkeypatch.setattr(reuse, "describe_own_version", lambda: "later")
+    scored_commands.clear()
+    assert not trained("y/demo", "b") and [command for _, command, _ in scored_commands] == ["compress"]
 
 
-def test_a_folder_that_is_no_work_tree_has_no_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
-    with pytest.raises(HyrfError, match="git cannot tell the version"):
-        describe_version(tmp_path)
+def test_kernels_are_compiled_before_the_first_timed_run_of_a_version(scored_commands, tmp_path):
+    scene = SimpleNamespace(path=Path("demo"), test=[])
+    for version in ("a", "b"):
+        for seed in (0, 1):
+            out = tmp_path / f"{version}{seed}"
+            compare_versions.train_and_score(Path(version), scene, 100, None, seed, out, ["--no-exposure"])
+    trainings = [(version.name, words) for version, command, words in scored_commands if command == "train"]
+    assert [name for name, _ in trainings] == ["a", "a", "a", "b", "b", "b"]
+    for _, words in (trainings[0], trainings[3]):
+        assert words[-4:] == ("--steps", "20", "--max-gaussians", "500") and "--no-exposure" in words
 
 
-def test_a_run_is_kept_only_for_the_same_versions_and_options(tmp_path: Path):
-    out, training = tmp_path / "run", {"version": "a", "options": ["--no-exposure"], "gaussians": None}
+def test_options_of_the_other_version_may_be_several_and_have_values(monkeypatch):
+    parser = compare_versions.make_parser()
+    args = parser.parse_args(["--against", "../before", "--against-options=--no-exposure --sh-degree 2"])
+    assert args.against_options == ["--no-exposure", "--sh-degree", "2"]
 
-    def fill() -> None:
-        for name in ("model.hyrf", "scores.json", "scores-0.5.json"):
-            (out / name).touch()
 
-    def left() -> set[str]:
-        return {path.name for path in out.iterdir()} - {"versions.json"}
-
-    remove_outdated(out, training, "now")
-    fill()
-    remove_outdated(out, training, "now")
-    assert left() == {"model.hyrf", "scores.json", "scores-0.5.json"}
-    remove_outdated(out, training, "later")
-    assert left() == {"model.hyrf"}
-    for changed in ({"version": "b"}, {"options": []}, {"gaussians": 100}):
-        fill()
-        remove_outdated(out, training | changed, "later")
-        assert left() == set()
-        remove_outdated(out, training, "later")
+def test_a_command_that_is_killed_without_output_is_reported_with_its_exit_code(tmp_path):
+    (tmp_path / "hyrfpack").mkdir()
+    (tmp_path / "hyrfpack" / "__init__.py").touch()
+    (tmp_path / "hyrfpack" / "__main__.py").write_text("import os; os.kill(os.getpid(), 9)")
+    with pytest.raises(HyrfError, match="`hyrfpack train` ended with exit code -9: no output"):
+        compare_versions._run_command(tmp_path, "train")

@@ -37,6 +37,7 @@ from hyrfpack.scene import Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig
 from tools.command import run_command
 from tools.studies.ablation_models import FULL_VARIANT, NO_CULLING_VARIANT, TRAINED_VARIANTS, Variant, build_trainer
+from tools.studies.reuse import describe_origin, remove_outdated
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
 
@@ -223,21 +224,22 @@ def _format_mean_and_spread(values: list[float], sign: str) -> str:
 
 def main() -> None:
     parser = make_study_parser(__doc__, steps=1000, sets=DEFAULT_SETS, out=Path("runs/ablations"))
-    parser.add_argument("--reuse", action="store_true", help="do not repeat results that --out has for these steps")
+    parser.add_argument("--reuse", action="store_true", help="do not repeat results of this version in --out")
     args = parser.parse_args()
     chosen = [
         v for v in ALL_VARIANTS if v is FULL_VARIANT or not args.only or any(part in v.name for part in args.only)
     ]
     out = args.out / str(args.steps)
-    out.mkdir(parents=True, exist_ok=True)
     results: Results = defaultdict(list)
     for seed, name in product(range(args.seeds), args.sets):
         scene, cache = hyrfpack.load_scene(args.data / name), PictureCache()
+        folder = out / f"{name}-{seed}"
+        remove_outdated(folder, describe_origin(args.data / name, steps=args.steps, seed=seed))
         for variant in chosen:
-            path = out / f"{name}-{seed}-{variant.name.replace(' ', '-')}.json"
+            path = folder / f"{variant.name.replace(' ', '-')}.json"
             if not (args.reuse and path.exists()):
                 config = TrainConfig(steps=args.steps, seed=seed)
-                result = train_and_measure(variant, scene, config, out / f"{name}-{seed}.hyrf", cache)
+                result = train_and_measure(variant, scene, config, folder / "full.hyrf", cache)
                 path.write_text(json.dumps(result, indent=1))
             result = json.loads(path.read_text())
             results[variant.name, name].append(result)

@@ -13,23 +13,26 @@ so one budget is enough for the change of bytes at equal PSNR:
 
     python -m tools.studies.compare_versions --against ../before --shares measured --sizes 1 0.7 0.5 0.35
 
-Runs are kept in --out and are not repeated while the version that trains them and its options stay the same. Their
-scores are kept while this version stays the same. Uncommitted changes count as another version. The other version runs
-with the packages of this environment, and with --against-options for `train`.
+Runs are kept in --out and are not repeated while their data set, the version that trains them and its options stay
+the same. Their scores are kept while this version stays the same. Uncommitted changes and untracked files count as
+another version. The other version runs with the packages of this environment, and with --against-options for `train`.
+CPU seconds are without the compilation of kernels: each version first trains a few steps on the data set.
 """
 
 from __future__ import annotations
 
-import hashlib
+import argparse
 import json
 import os
-import shutil
+import shlex
 import subprocess
 import sys
 import warnings
 from collections.abc import Sequence
+from functools import cache
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -41,10 +44,10 @@ from hyrfpack.train import TrainConfig
 from hyrfpack.train.setup import budget_for
 from tools.command import run_command
 from tools.cpu_time import children_cpu_seconds
+from tools.studies.reuse import REPOSITORY_ROOT, describe_origin, describe_version, remove_outdated
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
 
-REPOSITORY_ROOT = Path(__file__).parents[2]
 DEFAULT_SETS = (
     "drone_brighton_beach",
     "drone_caliterra",
@@ -61,7 +64,8 @@ DEFAULT_SETS = (
 )
 ESTIMATED_BUDGET_SHARE = "measured"
 SCORE_KEYS = ("bytes", "psnr", "ssim", "seconds", "gaussians")
-VERSIONS_FILE = "versions.json"
+COMPILING_STEPS = 20
+COMPILING_GAUSSIANS = 500
 
 
 def train_and_score(
@@ -78,20 +82,22 @@ def train_and_score(
 
     With `gaussians` None, the version chooses its budget. `options` are further options of its command `train`. `size`
     is the share of the bytes of the version's default file that the scored file may have; 1 for that file itself. What
-    `out` holds is used again where it comes from the same versions, options and number of Gaussians.
+    `out` holds is used again where it comes from the same versions, data, options and number of Gaussians.
     """
-    training = {"version": describe_version(version), "options": list(options), "gaussians": gaussians}
-    remove_outdated(out, training, describe_version(REPOSITORY_ROOT))
+    settings = {"steps": steps, "seed": seed, "options": list(options), "gaussians": gaussians}
+    remove_outdated(out, describe_origin(scene.path, describe_version(version), **settings))
+    remove_outdated(out / "scores", describe_origin(scene.path))
     suffix = "" if size == 1 else f"-{size:g}"
-    scores_file = out / f"scores{suffix}.json"
+    scores_file = out / "scores" / f"scores{suffix}.json"
     if scores_file.exists():
         return json.loads(scores_file.read_text())
     cpu_time = out / "cpu_seconds.json"  # The last file of a training.
     if not cpu_time.exists():
-        settings = ["--steps", str(steps), "--seed", str(seed), "--overwrite", *options]
+        compile_kernels(version, scene.path, tuple(options))
+        command_options = ["--steps", str(steps), "--seed", str(seed), "--overwrite", *options]
         budget = [] if gaussians is None else ["--max-gaussians", str(gaussians)]
         before = children_cpu_seconds()
-        _run_command(version, "train", str(scene.path), "-o", str(out), *settings, *budget)
+        _run_command(version, "train", str(scene.path), "-o", str(out), *command_options, *budget)
         cpu_time.write_text(json.dumps(children_cpu_seconds() - before))
     default_file, packed = out / "compact.hyrf", out / f"compact{suffix}.hyrf"
     packed.unlink(missing_ok=True)
@@ -109,37 +115,12 @@ def train_and_score(
     return result
 
 
-def describe_version(folder: Path) -> str:
-    """Return a name of the commit that a work tree holds, with a digest of its uncommitted changes.
-
-    Raises:
-        HyrfError: the folder is no work tree of git.
-    """
-
-    def run_git(*words: str) -> str:
-        process = subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True, check=False)
-        if process.returncode:
-            problem = f"{folder}: git cannot tell the version ({process.stderr.strip()})"
-            raise HyrfError(problem, fix="make the folder with git worktree add")
-        return process.stdout.strip()
-
-    name = run_git("describe", "--always", "--dirty", "--abbrev=12")
-    if name.endswith("-dirty"):
-        name += "-" + hashlib.sha256(run_git("diff", "HEAD").encode()).hexdigest()[:8]
-    return name
-
-
-def remove_outdated(out: Path, training: dict, scoring: str) -> None:
-    """Remove a run that was not trained as `training` says, or its scores if they are not of the version `scoring`."""
-    record = out / VERSIONS_FILE
-    versions = json.loads(record.read_text()) if record.exists() else {}
-    if versions.get("training") != training:
-        shutil.rmtree(out, ignore_errors=True)
-    elif versions["scoring"] != scoring:
-        for path in out.glob("scores*.json"):
-            path.unlink()
-    out.mkdir(parents=True, exist_ok=True)
-    record.write_text(json.dumps({"training": training, "scoring": scoring}))
+@cache
+def compile_kernels(version: Path, data: Path, options: tuple[str, ...]) -> None:
+    """Train a few steps with a version, so that the CPU time of its runs is without the compilation of its kernels."""
+    with TemporaryDirectory() as folder:
+        steps = ["--steps", str(COMPILING_STEPS), "--max-gaussians", str(COMPILING_GAUSSIANS)]
+        _run_command(version, "train", str(data), "-o", str(Path(folder, "run")), *options, *steps)
 
 
 def _run_command(version: Path, command: str, *arguments: str) -> None:
@@ -148,7 +129,9 @@ def _run_command(version: Path, command: str, *arguments: str) -> None:
     command_line = [sys.executable, "-m", "hyrfpack", command, *arguments]
     process = subprocess.run(command_line, env=environment, cwd=version, capture_output=True, text=True, check=False)
     if process.returncode:
-        raise SystemExit(f"{version}: {command} failed: {process.stderr.strip().splitlines()[-1]}")
+        last_line = (process.stderr.strip().splitlines() or ["no output"])[-1]
+        problem = f"{version}: `hyrfpack {command}` ended with exit code {process.returncode}: {last_line}"
+        raise HyrfError(problem, fix=f"run it in that folder: {shlex.join(['hyrfpack', command, *arguments])}")
 
 
 def bytes_change_at_equal_psnr(ours: np.ndarray, theirs: np.ndarray) -> float | None:
@@ -228,7 +211,8 @@ def mean_over_seeds(points: Sequence[dict[str, float]]) -> dict[str, float]:
     return {key: float(np.mean([point[key] for point in points])) for key in SCORE_KEYS}
 
 
-def main() -> None:
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser = make_study_parser(__doc__ or "", 2000, DEFAULT_SETS, Path("runs/quality"))
     parser.add_argument("--against", type=Path, required=True, help="folder of the other version")
     parser.add_argument(
@@ -237,8 +221,17 @@ def main() -> None:
     parser.add_argument(
         "--sizes", type=float, nargs="+", default=[1.0], help="bytes of the files, as shares of the default file's (1)"
     )
-    parser.add_argument("--against-options", nargs="*", default=[], help="options of `train` for the other version")
-    args = parser.parse_args()
+    parser.add_argument(
+        "--against-options",
+        type=shlex.split,
+        default=[],
+        help="options of `train` for the other version, as one text: --against-options='--no-exposure --sh-degree 2'",
+    )
+    return parser
+
+
+def main() -> None:
+    args = make_parser().parse_args()
     shows_scores = args.shares == [ESTIMATED_BUDGET_SHARE] and args.sizes == [1.0]
     header = _SCORES_HEADER if shows_scores else _TABLE_HEADER
     versions = {"now": REPOSITORY_ROOT, "before": args.against.resolve()}

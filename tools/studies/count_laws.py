@@ -3,8 +3,8 @@
     python -m tools.studies.count_laws --sets mipnerf360_bonsai --sizes 400 200 --counts 8000 16000 32000 64000
     python -m tools.studies.count_laws --table --survey results          prints the table, and writes CSV files
 
-Runs are kept in --out/SET/STEPS/SIZE/COUNT. Those that are there are not repeated, unless --lpips-weights are given and
-a run has no LPIPS.
+Runs are kept in --out/SET/STEPS/SIZE/COUNT. Those of this version that are there are not repeated, unless
+--lpips-weights are given and a run has no LPIPS.
 
 The first table has one row for each run: PSNR (dB) and SSIM of the compact file on held-out photos, its bytes, and its
 bits per Gaussian of positions, of the other properties, of the hash tables, and of decoders and metadata. The second
@@ -31,6 +31,7 @@ from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
 from hyrfpack.format.sections import LOGIT_SECTIONS, POSITIONS, TABLE_SECTIONS
 from hyrfpack.train import TrainConfig
 from tools.command import run_command
+from tools.studies.reuse import describe_origin, remove_outdated
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
 
@@ -158,6 +159,7 @@ def main() -> None:
         for size in () if args.table else args.sizes:
             for count in args.counts:
                 folder = out / str(size) / str(count)
+                remove_outdated(folder, describe_origin(args.data / name, size=size, count=count, steps=args.steps))
                 if not has_row(folder, needs_lpips=args.lpips_weights is not None):
                     measure(args.data / name, size, count, args.steps, folder, args.lpips_weights)
         rows = read_rows(out)

@@ -4,11 +4,11 @@
     python -m tools.studies.long_runs --steps 30000 --table                     only prints the table
 
 Short runs come first. If a call is stopped, the next one resumes from the checkpoint and does not repeat finished runs.
-Several calls can share one queue, because each run's folder is locked while it is trained and measured. --finetune adds
-a fine-tuned file also to finished runs. The table has
-PSNR in dB and SSIM of the raw file on held-out photos, and the gap, which is PSNR on up to 16 training photos minus
-that. It also has bytes and scores of the compressed files as decoded from disk, and seconds of training. Fewer steps
-are taken than asked for if pilot runs say so.
+Runs of another version or data set are named, and neither resumed nor repeated. Several calls can share one queue,
+because each run's folder is locked while it is trained and measured. --finetune adds a fine-tuned file also to finished
+runs. The table has PSNR in dB and SSIM of the raw file on held-out photos, and the gap, which is PSNR on up to 16
+training photos minus that. It also has bytes and scores of the compressed files as decoded from disk, and seconds of
+training. Fewer steps are taken than asked for if pilot runs say so.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from hyrfpack.lock import exclusive_folder
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig
 from tools.command import run_command
+from tools.studies.reuse import check_origin, describe_origin, write_origin
 from tools.studies.set_variants import load_variant
 from tools.studies.train_sets import DATA_FOLDER, list_sets
 from tools.tables import markdown_table
@@ -54,15 +55,22 @@ class QueuedRun:
         return out / f"{self.steps}{gains}" / f"seed{self.seed}" / self.name
 
 
-def measure(run: QueuedRun, data: Path, out: Path, finetune_steps: int) -> None:
+def measure(run: QueuedRun, data: Path, out: Path, finetune_steps: int) -> bool:
     """Train a run, resuming from its checkpoint if there is one, and write its row into its folder.
 
-    A run that has a row only gets a fine-tuned file.
+    A run that has a row only gets a fine-tuned file, and only if it is missing. Returns whether anything was done.
 
     Raises:
-        HyrfError: the data set cannot be read, or a file cannot be written.
+        HyrfError: the data set cannot be read, a file cannot be written, or another version has begun the run.
     """
     folder = run.folder(out)
+    origin = describe_origin(data / run.name, **asdict(run))
+    if any((folder / name).exists() for name in (MEASUREMENT_FILE, METRICS_FILE, CHECKPOINT_FILE)):
+        check_origin(folder, origin)
+    else:
+        write_origin(folder, origin)
+    if is_finished(folder, finetune_steps):
+        return False
     scene = load_variant(data, run.name)
     if (folder / MEASUREMENT_FILE).exists():
         row = json.loads((folder / MEASUREMENT_FILE).read_text())
@@ -72,6 +80,7 @@ def measure(run: QueuedRun, data: Path, out: Path, finetune_steps: int) -> None:
         tuned = _compress_and_score(folder, scene, "compact", finetune_steps)
         row["finetuned"] = {**tuned, "steps": finetune_steps}
     (folder / MEASUREMENT_FILE).write_text(json.dumps(row, indent=1))
+    return True
 
 
 def is_finished(folder: Path, finetune_steps: int) -> bool:
@@ -183,12 +192,10 @@ def main() -> None:
         lock = folder.with_name(f"{folder.name}.queue")  # training locks the folder itself
         try:
             with exclusive_folder(lock):
-                if is_finished(folder, args.finetune):
-                    continue
                 started = time.strftime("%H:%M")
-                measure(run, args.data, args.out, args.finetune)
-                print(f"{started} to {time.strftime('%H:%M')}  {folder}", flush=True)
-        except HyrfError as error:  # another call trains it, or the data set cannot be read
+                if measure(run, args.data, args.out, args.finetune):
+                    print(f"{started} to {time.strftime('%H:%M')}  {folder}", flush=True)
+        except HyrfError as error:  # another call trains it, another version has, or the data set cannot be read
             print(f"{folder}: {error}", flush=True)
     print(format_table(list(read_finished_rows(args.out))))
 

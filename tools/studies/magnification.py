@@ -5,7 +5,8 @@
 Each set is trained on its photos at half their size and compressed. The table has PSNR in dB and SSIM of the compact
 file on held-out photos, at half the size and at the full one, which training has not seen. "One pixel" has the filter
 of 0.3 px^2 alone and evaluates the background at every pixel; "photos" samples the scene no more finely than the photos
-did, as `hyrfpack.render_view` does (docs/reference/format.md, 2.10). Runs are kept in --out and are not repeated.
+did, as `hyrfpack.render_view` does (docs/reference/format.md, 2.10). Runs are kept in --out, and those of this
+version are not repeated.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from pathlib import Path
 import hyrfpack
 from tools.command import run_command
 from tools.studies.compare_versions import DEFAULT_SETS
+from tools.studies.reuse import describe_origin, remove_outdated
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
 
@@ -35,6 +37,7 @@ def measure(data: Path, steps: int, seed: int, out: Path) -> list[tuple[float, f
     longest = max(max(view.camera.width, view.camera.height) for view in photos.views)
     reduced = hyrfpack.load_scene(data, max_size=longest // PHOTO_REDUCTION)
     packed = out / "compact.hyrf"
+    remove_outdated(out, describe_origin(data, steps=steps, seed=seed))
     if not packed.exists():
         hyrfpack.train_model(reduced, out, hyrfpack.TrainConfig(steps=steps, seed=seed), overwrite=True)
         hyrfpack.compress_model(out / "model.hyrf", packed)

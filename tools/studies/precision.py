@@ -14,7 +14,8 @@ Rows, all of one seed:
 
 A difference from `float32` is significant only if it is larger than the spread of the nudged rows. Training amplifies
 any rounding until two runs differ as much as two seeds. The table has PSNR in dB and SSIM on held-out views, the number
-of Gaussians and seconds. Scores that --out already has are not measured again.
+of Gaussians and seconds. Scores of this version that --out already has are not measured again. The row `float32` is
+always there, because all others are compared with it.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ from hyrfpack.train import TrainConfig
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.trainer import Trainer
 from tools.command import run_command
+from tools.studies.reuse import describe_origin
 from tools.studies.train_sets import make_study_parser
 
 MLP_LOOKUPS = ("hyrfpack.model.field.mlp", "hyrfpack.ops.background.reference.mlp")
@@ -54,7 +56,8 @@ OPERATION_BY_LOOKUP = {
     "hyrfpack.train.gradients.photometric_loss": photometric_loss,
 }
 RASTERIZE_LOOKUP = "hyrfpack.render.renderer.rasterize"
-ALL_ROWS = ("float32", *(f"nudged {n}" for n in range(1, 7)), "mixed", "adam", "rasterizer", "float64")
+BASELINE_ROW = "float32"
+ALL_ROWS = (BASELINE_ROW, *(f"nudged {n}" for n in range(1, 7)), "mixed", "adam", "rasterizer", "float64")
 DEFAULT_SETS = ("nerf_synthetic_lego", "indoor_room")
 NUDGE_STD = 1e-7
 
@@ -123,15 +126,17 @@ def main() -> None:
     print("| set | row | PSNR | against float32 | SSIM | Gaussians | seconds |\n|---|---|---|---|---|---|---|")
     for name in args.sets:
         scene = hyrfpack.load_scene(args.data / name)
-        for row in (row for row in ALL_ROWS if any(part in row for part in args.only or ALL_ROWS)):
+        origin = describe_origin(args.data / name, steps=args.steps)
+        for row in (row for row in ALL_ROWS if row == BASELINE_ROW or any(word in row for word in args.only or [""])):
             key = f"{name}, {row}, {args.steps}"
-            if key not in scores:
+            if scores.get(key, {}).get("origin") != origin:
                 model, seconds = train_row(scene, TrainConfig(steps=args.steps), row)
                 found = evaluate_model(model, scene.test)
                 scores[key] = {"psnr": found.psnr, "ssim": found.ssim, "gaussians": len(model), "seconds": seconds}
+                scores[key]["origin"] = origin
                 args.out.mkdir(parents=True, exist_ok=True)
                 scores_file.write_text(json.dumps(scores, indent=1))
-            score, base = scores[key], scores.get(f"{name}, float32, {args.steps}", {}).get("psnr", float("nan"))
+            score, base = scores[key], scores[f"{name}, {BASELINE_ROW}, {args.steps}"]["psnr"]
             print(
                 f"| {name} | {row} | {score['psnr']:.3f} | {score['psnr'] - base:+.3f} | {score['ssim']:.4f} | "
                 f"{score['gaussians']:,} | {score['seconds']:.0f} |",

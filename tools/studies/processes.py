@@ -3,8 +3,9 @@
     python -m tools.studies.processes --sets gerrard_hall indoor_room --steps 2000 --processes 1 2 4
 
 Each process has one thread. The table has PSNR in dB and SSIM on held-out photos with their differences from one
-process, seconds, and the share of time waiting for other processes. "Of the ideal" is the seconds of one process
-divided by W times those of W processes; it is meaningful only if each process has its own core.
+process, seconds, and the share of time waiting for other processes. Parallel efficiency is W0 T0 / (W T) for
+the first number W0 of processes, which takes T0 seconds, and W processes, which take T. It is meaningful only if each
+process has its own core.
 """
 
 from __future__ import annotations
@@ -18,12 +19,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tools.command import run_command
+from tools.studies.reuse import describe_origin, remove_outdated
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
 
 def train(data: Path, out: Path, processes: int, options: Sequence[str]) -> dict:
-    """Train with several processes unless the run exists; return its metrics."""
+    """Train with several processes unless this version has made the run; return its metrics."""
+    remove_outdated(out, describe_origin(data, processes=processes, options=list(options)))
     if not (out / "metrics.json").exists():
         command = [sys.executable, "-m", "hyrfpack", "train", str(data), "-o", str(out), "--processes", str(processes)]
         environment = {**os.environ, "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1"}
@@ -33,8 +36,9 @@ def train(data: Path, out: Path, processes: int, options: Sequence[str]) -> dict
     return json.loads((out / "metrics.json").read_text())
 
 
-def format_row(name: str, processes: int, metrics: dict, baseline: dict) -> list[str]:
+def format_row(name: str, processes: int, metrics: dict, baseline_processes: int, baseline: dict) -> list[str]:
     """Format the row of a run, compared with the metrics of a baseline: the run on the first number of processes."""
+    speedup = baseline["seconds"] / metrics["seconds"]
     scores, first = metrics["evaluation"], baseline["evaluation"]
     exchange = metrics["stage_seconds"].get("exchange", 0.0)
     return [
@@ -45,7 +49,7 @@ def format_row(name: str, processes: int, metrics: dict, baseline: dict) -> list
         f"{scores['ssim']:.4f} ({scores['ssim'] - first['ssim']:+.4f})",
         f"{metrics['seconds']:.0f}",
         f"{exchange / metrics['seconds']:.1%}",
-        f"{baseline['seconds'] / metrics['seconds'] / processes:.2f}",
+        f"{speedup * baseline_processes / processes:.2f}",
     ]
 
 
@@ -69,9 +73,10 @@ def main(arguments: list[str] | None = None) -> None:
             )
             for count in options.processes
         }
-        rows += [format_row(name, count, metrics, runs[options.processes[0]]) for count, metrics in runs.items()]
+        first = options.processes[0]
+        rows += [format_row(name, count, metrics, first, runs[first]) for count, metrics in runs.items()]
         print(" | ".join(rows[-1]), file=sys.stderr)
-    header = ["set", "processes", "Gaussians", "PSNR", "SSIM", "seconds", "waiting for others", "of the ideal"]
+    header = ["set", "processes", "Gaussians", "PSNR", "SSIM", "seconds", "waiting for others", "parallel efficiency"]
     print(markdown_table(header, rows))
 
 

@@ -8,7 +8,7 @@
 The columns are PSNR in dB, SSIM, numbers of Gaussians, bytes, losses in dB, seconds of compression, training steps per
 second, training seconds, and ms per frame. Scores are those of the decoded files on held-out views (every 8th;
 Blender-style sets have their own split). Runs are kept in --out (runs/sets/<steps>), and --reuse only measures
-those with the same --steps and --seed, and --exposure or --no-exposure if one is given.
+those. It refuses runs of another version, data set, --steps, --seed or --exposure.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import hyrfpack
 from hyrfpack.errors import HyrfError
 from hyrfpack.train import TrainConfig
 from tools.command import run_command
+from tools.studies.reuse import ORIGIN_FILE, check_origin, describe_origin, write_origin
 from tools.studies.set_variants import load_variant
 from tools.tables import markdown_table
 
@@ -46,26 +47,20 @@ def list_sets(data: Path) -> list[str]:
     return names
 
 
-def has_run(out: Path, config: TrainConfig) -> bool:
-    """Return whether a folder has a run with these steps, this seed and, unless pilot runs decide, this exposure.
-
-    A run of which pilot runs chose the number of steps may have taken fewer.
-    """
-    if not (out / "metrics.json").exists():
-        return False
-    metrics = json.loads((out / "metrics.json").read_text())
-    settings = metrics["settings"]
-    names = ["seed"] + (["exposure"] if config.exposure is not None else [])
-    is_chosen = config.early_stop and "steps" in metrics["choices"] and settings["steps"] < config.steps
-    has_steps = settings["steps"] == config.steps or is_chosen
-    return has_steps and all(settings[name] == getattr(config, name) for name in names)
-
-
 def measure(data: Path, name: str, out: Path, config: TrainConfig, reuse: bool) -> dict:
-    """Train one data set, compress the model with each lossy profile, and score all files; return the row."""
+    """Train one data set, compress the model with each lossy profile, and score all files; return the row.
+
+    Raises:
+        HyrfError: with `reuse`, the run in `out` is of another version, data set or configuration.
+    """
     scene = load_variant(data, name)
-    if not (reuse and has_run(out, config)):
+    origin = describe_origin(data / name, steps=config.steps, seed=config.seed, exposure=config.exposure)
+    if reuse and (out / "metrics.json").exists():
+        check_origin(out, origin)
+    else:
+        (out / ORIGIN_FILE).unlink(missing_ok=True)
         hyrfpack.train_model(scene, out, config, overwrite=True)
+        write_origin(out, origin)
     trained = json.loads((out / "metrics.json").read_text())
     model = out / "model.hyrf"
     packed: dict[str, float] = {}
@@ -147,7 +142,9 @@ def main() -> None:
         action=argparse.BooleanOptionalAction,
         help="learn per-image gains or not (default: pilot runs decide)",
     )
-    parser.add_argument("--reuse", action="store_true", help="do not repeat runs that --out has with these settings")
+    parser.add_argument(
+        "--reuse", action="store_true", help="measure the runs that --out has, and train only missing ones"
+    )
     args = parser.parse_args()
     out = args.out or Path("runs/sets") / str(args.steps)
     names = args.sets or list_sets(args.data)
