@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from time import perf_counter
 
 import numpy as np
 import torch
@@ -14,8 +13,9 @@ from torch import Tensor
 
 from hyrfpack.bench.rows import Row, format_value
 from hyrfpack.bench.subject import Subject
-from hyrfpack.compress.quantize import plan_and_quantize
-from hyrfpack.compress.sensitivity import measure_sensitivity
+from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
+from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB
+from hyrfpack.compress.packer import Packer
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
@@ -76,7 +76,7 @@ def codec_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row
     cases: list[EncodingCase] = []
     for profile in PROFILES:
         try:
-            cases += _encoding_cases(subject, profile, notes)
+            cases += _encoding_cases(subject, profile)
         except HyrfError as error:
             notes.append(f"profile '{profile}' is left out: {error}")
     names = {f"{case.setting} {case.value}": case for case in cases}
@@ -135,12 +135,12 @@ def _match_gaussians(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> 
     return cKDTree(rows[1] / size).query(rows[0] / size)[1]
 
 
-def _encoding_cases(subject: Subject, profile: str, notes: list[str]) -> Iterator[EncodingCase]:
+def _encoding_cases(subject: Subject, profile: str) -> Iterator[EncodingCase]:
     """Yield the profile with its defaults, then each value of each of its settings."""
     if profile == "compact":
-        encode, defaults = _compact_encoder(subject, notes)
+        encode, defaults = _compact_encoder(subject)
     else:
-        encode, defaults = _encoder(subject.model, profile)
+        encode, defaults = _encoder(subject, profile)
     itself = EncodingCase("profile", profile, profile == CompressConfig.profile, encode)
     yield itself
     for name, values in PROFILE_SETTING_VALUES.get(profile, {}).items():
@@ -154,27 +154,24 @@ def _encoding_cases(subject: Subject, profile: str, notes: list[str]) -> Iterato
                 yield EncodingCase(f"{profile}, {name}", _format_value(value), False, partial(encode, **{name: value}))
 
 
-def _encoder(model: HybridModel, profile: str) -> tuple[Callable[..., bytes], dict]:
+def _encoder(subject: Subject, profile: str) -> tuple[Callable[..., bytes], dict]:
     """Return a function that encodes the model with settings of a profile, and the defaults of the settings."""
-    encode = partial(encode_model, model, profile)
+    encode = partial(encode_model, subject.model, profile, subject.provenance)
     defaults = read_metadata(read_container(encode(), SECTION_CONTENTS)).settings
     # JSON has no tuples, so they were read as lists.
     return encode, {name: tuple(value) if isinstance(value, list) else value for name, value in defaults.items()}
 
 
-def _compact_encoder(subject: Subject, notes: list[str]) -> tuple[Callable[..., bytes], dict]:
-    """Do what `_encoder` does, for profile "compact"; the sensitivity is measured once for all settings."""
-    start = perf_counter()
-    with torch.enable_grad():
-        sensitivity = measure_sensitivity(subject.model, subject.capture)
-    notes.append(
-        f"measuring the sensitivities for profile 'compact' took {perf_counter() - start:.1f} s; all its settings "
-        "share them, and no time in the table includes this"
-    )
+def _compact_encoder(subject: Subject) -> tuple[Callable[..., bytes], dict]:
+    """Do what `_encoder` does, for profile "compact": all that `hyrfpack compress` does between reading and writing."""
 
-    def encode(distortion: float = subject.distortion, prune: bool = True) -> bytes:
-        quantized = plan_and_quantize(subject.model, sensitivity, distortion, prune)
-        return encode_model(subject.model, "compact", quantized=quantized)
+    @torch.enable_grad()  # for the sensitivities
+    def encode(distortion: float | None = None, prune: bool = True) -> bytes:
+        target = distortion or subject.distortion
+        sensitivity, references = measure_calibrated_sensitivity(subject.model, subject.capture, target, prune)
+        packer = Packer(subject.model, subject.provenance, sensitivity, subject.scene, prune=prune)
+        target_drop = DEFAULT_PSNR_DROP_DB if distortion is None else None
+        return packer.encode_to_distortion(target, references, target_drop).data
 
     return encode, {"distortion": subject.distortion, "prune": True}
 

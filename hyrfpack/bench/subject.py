@@ -6,7 +6,7 @@ import logging
 import os
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -26,6 +26,7 @@ from hyrfpack.device import upload
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.format import describe_file, load_model
+from hyrfpack.format.codec import packed_provenance
 from hyrfpack.measure.error import measure_error
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Scene, View, evenly_spaced
@@ -52,6 +53,8 @@ class Subject:
         photos: (H, W, 3) photo in [0, 1] and (H, W) mask or None of each viewpoint; None if there are no photos.
         capture: the cameras of the training photos, at which compression measures sensitivities.
         distortion: mean squared error of pictures that compression aims at by default.
+        provenance: what a compressed file says of the model's origin.
+        scene: the photos whose loss compression limits; None if there are none.
     """
 
     name: str
@@ -61,6 +64,8 @@ class Subject:
     photos: list[tuple[Tensor, Tensor | None]] | None
     capture: list[Camera]
     distortion: float
+    provenance: dict[str, Any] = field(default_factory=dict)
+    scene: Scene | None = None
 
     def scores(self, pictures: Sequence[Tensor], exact: Sequence[Tensor]) -> tuple[float, float]:
         """Compute the mean PSNR and SSIM over views, against the photos, or without photos against `exact`."""
@@ -129,6 +134,8 @@ def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
         photos,
         capture.cameras,
         default_distortion(facts["provenance"]),
+        packed_provenance(facts["provenance"], model),
+        scene,
     )
 
 
@@ -150,7 +157,7 @@ def built_in_subject() -> Subject:
         if trained.model is None:  # training treats Ctrl-C as a request to stop
             raise KeyboardInterrupt
         subject = read_subject(trained.model, scene)
-    return replace(subject, name="built-in")
+    return replace(subject, name="built-in", scene=None)  # whose photos were removed with the folder
 
 
 def _load_held_out_photos(scene: Scene, model: HybridModel) -> tuple[list[View], list[tuple[Tensor, Tensor | None]]]:
