@@ -83,7 +83,7 @@ class DemoResult:
     """The result of a demo.
 
     Attributes:
-        steps, gaussians: number of training steps and of trained Gaussians.
+        steps, gaussians: number of training steps that were taken, and of trained Gaussians.
         train_seconds: time of the training, including the compilation of kernels.
         frames_per_second: inverse of the median time to render a held-out view from the compact file.
         profiles: results of the profiles raw, paper and compact.
@@ -178,7 +178,7 @@ def _run_demo(folder: Path, steps: int, views: int, size: int, overwrite: bool) 
     _LOG.info("making a page for the browser")
     page = export_model(path, folder / PAGE_FILE, data=scene, overwrite=overwrite)
     result = DemoResult(
-        steps=steps,
+        steps=trained.step,
         gaussians=len(model),
         train_seconds=trained.metrics["seconds"],
         frames_per_second=1 / scores.seconds_per_frame,
