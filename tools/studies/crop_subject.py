@@ -65,14 +65,14 @@ def _median_depth(model: HybridModel, camera: Camera) -> np.ndarray:
     return render_median_depth(model, camera, model.decode(), index, RenderSettings()).numpy()
 
 
-def subject(cameras: list[Camera], share: float) -> Sphere:
+def find_subject(cameras: list[Camera], share: float) -> Sphere:
     """Return the sphere about the point that the cameras look at."""
     center = np.array(Viewpoint.from_cameras(cameras).center)
     distances = np.linalg.norm(np.array([camera.position for camera in cameras]) - center, axis=1)
     return Sphere(center, share * float(np.median(distances)))
 
 
-def masked_views(views: list[View], masks: list[np.ndarray]) -> list[View]:
+def mask_views(views: list[View], masks: list[np.ndarray]) -> list[View]:
     """Return the views that show enough of the subject, with its pixels as their mask."""
     pairs = [pair for pair in zip(views, masks, strict=True) if np.count_nonzero(pair[1]) >= MIN_PIXELS]
     return [mask_view(*pair) for pair in pairs]
@@ -80,7 +80,7 @@ def masked_views(views: list[View], masks: list[np.ndarray]) -> list[View]:
 
 def measure(model_file: Path, scene: Scene, share: float) -> list[str]:
     """Return the cells of one set, without its name and radius."""
-    sphere = subject([view.camera for view in scene.train], share)
+    sphere = find_subject([view.camera for view in scene.train], share)
     with tempfile.TemporaryDirectory() as folder:
         cropped, before, after = (Path(folder) / f"{each}.hyrf" for each in ("cropped", "before", "after"))
         action = CropSphere(tuple(sphere.center.tolist()), sphere.radius)
@@ -88,7 +88,7 @@ def measure(model_file: Path, scene: Scene, share: float) -> list[str]:
         hyrfpack.compress_model(model_file, before, context=QUIET)
         hyrfpack.compress_model(cropped, after, context=QUIET)
         model = hyrfpack.load_model(before).requires_grad_(False)
-        views = masked_views(scene.test, [sphere.mask(model, view.camera) for view in scene.test])
+        views = mask_views(scene.test, [sphere.mask(model, view.camera) for view in scene.test])
         cells: list[str] = []
         for path in (before, after):
             model = hyrfpack.load_model(path)

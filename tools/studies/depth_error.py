@@ -24,7 +24,7 @@ from hyrfpack.scene import Camera, Scene
 from tools.command import run_command
 from tools.scenes.catalog import LAYOUTS, make_scene
 from tools.scenes.render import cast_pixels
-from tools.studies.mesh_error import demo_depth, nearest_surface, statistics
+from tools.studies.mesh_error import compute_demo_depth, format_statistics, nearest_surface
 from tools.tables import markdown_table
 
 MAX_DEMO_DEPTH = 6
@@ -48,20 +48,20 @@ def main() -> None:
     arguments = parser.parse_args()
 
     scene = hyrfpack.load_scene(arguments.photos)
-    geometry = demo_geometry if arguments.kind == "demo" else set_geometry(arguments.kind, scene)
+    geometry = compute_demo_geometry if arguments.kind == "demo" else make_set_geometry(arguments.kind, scene)
     print_errors(hyrfpack.load_model(arguments.model), [view.camera for view in scene.test], geometry)
 
 
-def demo_geometry(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def compute_demo_geometry(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Return depth and normals of the built-in scene."""
-    depth = demo_depth(camera)
+    depth = compute_demo_depth(camera)
     depth[depth >= MAX_DEMO_DEPTH] = np.inf
-    points = rays_of(camera) * np.where(np.isfinite(depth), depth, 1)[..., None] - camera.camera_from_world[:3, 3]
+    points = make_rays(camera) * np.where(np.isfinite(depth), depth, 1)[..., None] - camera.camera_from_world[:3, 3]
     _, normals = nearest_surface((points @ camera.rotation).reshape(-1, 3))
     return depth, normals.reshape(*depth.shape, 3)
 
 
-def set_geometry(name: str, scene: Scene) -> Geometry:
+def make_set_geometry(name: str, scene: Scene) -> Geometry:
     """Return the function that casts the rays of a view of a generated set."""
     camera = scene.views[0].camera
     arrays = make_scene(name, len(scene.views), camera.width, camera.height, 0).arrays
@@ -90,23 +90,23 @@ def print_errors(model: HybridModel, cameras: list[Camera], geometry: Geometry) 
         known = np.isfinite(exact) & (depth.numpy() > 0)
         for name, found in (("expected", seen.depth), ("median", depth)):
             depth_errors[name].append(np.abs(found.numpy() - exact)[known] / exact[known])
-        rays = rays_of(camera) @ camera.rotation
+        rays = make_rays(camera) @ camera.rotation
         faces_away = (exact_normals * rays).sum(axis=-1, keepdims=True) > 0
         exact_normals = np.where(faces_away, -exact_normals, exact_normals)
         for name, weight in DEPTH_NORMAL_WEIGHTS.items():
             normals = surface.render_normals(gaussians, depth, frame, camera, settings, depth_weight=weight)
             cosines = (normals.numpy() * exact_normals).sum(axis=-1)[known]
             angles[name].append(np.degrees(np.arccos(cosines.clip(-1, 1))))
-    rows = [[name, *statistics(np.concatenate(parts))] for name, parts in depth_errors.items()]
+    rows = [[name, *format_statistics(np.concatenate(parts))] for name, parts in depth_errors.items()]
     print(markdown_table(["depth, relative error", "mean", "median", "95 %"], rows) + "\n")
     rows = []
     for name, parts in angles.items():
         joined = np.concatenate(parts)
-        rows.append([name, *statistics(joined), f"{(joined < SMALL_ANGLE_DEGREES).mean():.3f}"])
+        rows.append([name, *format_statistics(joined), f"{(joined < SMALL_ANGLE_DEGREES).mean():.3f}"])
     print(markdown_table(["normals, degrees", "mean", "median", "95 %", f"within {SMALL_ANGLE_DEGREES}"], rows))
 
 
-def rays_of(camera: Camera) -> np.ndarray:
+def make_rays(camera: Camera) -> np.ndarray:
     """Return rays (H, W, 3), camera axes, whose length along the view axis is 1."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5 - camera.cx, np.arange(camera.height) + 0.5 - camera.cy)
     return np.stack((x / camera.fx, y / camera.fy, np.ones(x.shape)), axis=-1)

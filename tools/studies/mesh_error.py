@@ -121,7 +121,7 @@ def nearest_surface(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return best, normals
 
 
-def demo_depth(camera: Camera) -> np.ndarray:
+def compute_demo_depth(camera: Camera) -> np.ndarray:
     """Return the depth (H, W) of the demo scene along the view axis; infinite in the sky."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5 - camera.cx, np.arange(camera.height) + 0.5 - camera.cy)
     rays = np.stack((x / camera.fx, y / camera.fy, np.ones(x.shape)), axis=-1).reshape(-1, 3) @ camera.rotation
@@ -155,9 +155,9 @@ def print_demo_error(mesh: Mesh, scene: Scene) -> None:
     completeness, _ = cKDTree(samples).query(seen)
     precision, recall = (accuracy < HIT_LIMIT).mean(), (completeness < HIT_LIMIT).mean()
     rows = [
-        ["accuracy", *statistics(accuracy)],
-        ["completeness", *statistics(completeness)],
-        ["normal error (degrees)", *statistics(angles)],
+        ["accuracy", *format_statistics(accuracy)],
+        ["completeness", *format_statistics(completeness)],
+        ["normal error (degrees)", *format_statistics(angles)],
     ]
     print(markdown_table(["", "mean", "median", "95 %"], rows))
     print(
@@ -168,7 +168,7 @@ def print_demo_error(mesh: Mesh, scene: Scene) -> None:
 
 def seen_points(camera: Camera) -> np.ndarray:
     """Return points (n, 3) of the demo scene's surfaces that a camera sees, evenly over its picture."""
-    depth = demo_depth(camera)
+    depth = compute_demo_depth(camera)
     stride = max(1, round((depth.size / SURFACE_RAYS_PER_CAMERA) ** 0.5))
     rows, columns = np.nonzero(np.isfinite(depth[::stride, ::stride]))
     rows, columns = stride * rows, stride * columns
@@ -219,7 +219,9 @@ def print_point_error(source: Source, mesh: Mesh, scene: Scene) -> None:
     rows_out = []
     for name, parts in errors.items():
         all_errors, known = np.concatenate(parts), np.concatenate(shares[name])
-        rows_out.append([name, f"{known.mean():.3f}", *statistics(all_errors), f"{(all_errors < 0.02).mean():.3f}"])
+        rows_out.append(
+            [name, f"{known.mean():.3f}", *format_statistics(all_errors), f"{(all_errors < 0.02).mean():.3f}"]
+        )
     total = sum(len(part) for part in shares["mesh"])
     columns = [f"depth at {total:,} points", "with depth", "mean", "median", "95 %", "within 2 %"]
     print(markdown_table(columns, rows_out) + "\n")
@@ -255,7 +257,7 @@ def _draw_triangles(corners, faces, depth):
                     depth[row, column] = min(depth[row, column], 1 / (u / a[2] + v / b[2] + w / c[2]))
 
 
-def statistics(values: np.ndarray) -> list[str]:
+def format_statistics(values: np.ndarray) -> list[str]:
     """Return mean, median and 95th percentile as cells of a table."""
     return [format_cell(float(number)) for number in (values.mean(), np.median(values), np.quantile(values, 0.95))]
 
