@@ -12,6 +12,7 @@ import pytest
 
 from hyrfpack.errors import HyrfError
 from tools.command import run_command
+from tools.safety.variants import __main__ as variants
 from tools.studies import export_table, mesh_scale
 from tools.studies.train_sets import list_sets
 
@@ -82,3 +83,23 @@ def test_an_unknown_format_is_refused_before_anything_is_read(
 def test_distances_to_the_disk_end_at_its_edge():
     points = np.array([[4.9, 0.0, 0.1], [8.0, 0.0, 4.0], [0.0, 0.0, 2.5]])
     np.testing.assert_allclose(mesh_scale.surface_distances(points), [0.1, 5.0, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(["missing"], "missing: there is no data set"), (["{data}", "--only", "no such variant"], "nothing was checked")],
+)
+def test_variants_of_a_missing_set_or_name_are_an_error(arguments, words, data, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "")  # which the tool replaces
+    monkeypatch.setattr(sys, "argv", ["variants", *(word.format(data=data) for word in arguments)])
+    with pytest.raises(HyrfError, match=words):
+        variants.main()
+
+
+@pytest.mark.parametrize("name", ["browser.build_types", "browser.build_player", "safety.make_golden"])
+def test_a_tool_without_options_refuses_arguments_before_it_writes(name, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [name, "--halp"])
+    monkeypatch.setattr("subprocess.run", None)
+    with pytest.raises(SystemExit) as exit_info:
+        importlib.import_module(f"tools.{name}").main()
+    assert exit_info.value.code == 2

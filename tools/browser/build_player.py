@@ -9,6 +9,7 @@ The same sources give the same bytes. It prints each file's length in bytes.
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 from pathlib import Path
 
@@ -57,6 +58,7 @@ def _run(name: str, *arguments: str, stdin: bytes = b"") -> bytes:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     for name, data in build_player().items():
         write_atomic(WEB_FOLDER / MINIFIED_FOLDER / name, data)
         print(f"{name}: {len(data):,} bytes")

@@ -8,6 +8,7 @@ the same bytes.
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import shutil
@@ -61,6 +62,7 @@ def declaration_name(module: str) -> str:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     declarations = build_types()
     shutil.rmtree(TYPES_FOLDER, ignore_errors=True)
     TYPES_FOLDER.mkdir()

@@ -8,6 +8,7 @@ replace one before the release, delete it by hand first.
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -196,6 +197,7 @@ def encode_golden_parts() -> bytes:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     for name, golden in GOLDEN_FILES.items():
         target = GOLDEN_FOLDER / f"{name}.hyrf"
         if target.exists():

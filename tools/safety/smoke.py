@@ -8,6 +8,7 @@ the golden files from the checkout. It prints one line for each check and ends w
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
@@ -71,6 +72,7 @@ def run_command(*arguments: object) -> str:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     print(f"hyrfpack {hyrfpack.__version__} in {Path(hyrfpack.__file__).parent}, Python {sys.version.split()[0]}")
     print(check_golden_files())
     with tempfile.TemporaryDirectory() as folder:

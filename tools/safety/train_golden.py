@@ -8,6 +8,7 @@ or when the format changes; a test compares their quality with that of a new tra
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 from pathlib import Path
@@ -46,6 +47,7 @@ def make_golden_scene(model_file: Path, folder: Path) -> Scene:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     sys.path.append(str(TESTS_FOLDER))  # the scene of balls is a module of the tests
     TRAINED_FOLDER.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:

@@ -13,12 +13,13 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
-import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
 
 from hyrfpack.data import load_scene
+from hyrfpack.errors import HyrfError
+from tools.command import run_command
 from tools.safety.variants.catalog import ALL_VARIANTS
 from tools.safety.variants.check import check_variant
 from tools.safety.variants.working_set import WorkingSet
@@ -39,7 +40,10 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="variants-") as folder:
         os.environ["XDG_CACHE_HOME"] = os.path.join(folder, "cache")
         for source in options.sets:
-            for layout in list_layouts(source):
+            layouts = list_layouts(source)
+            if not layouts:
+                raise HyrfError(f"{source}: there is no data set", fix="name the folder of a data set")
+            for layout in layouts:
                 original_set = WorkingSet(source, Path(folder, "plain"), layout)
                 original_scene = load_scene(original_set.root)
                 print(f"\n{source.name} as {layout}: {len(original_scene.views)} photos")
@@ -49,9 +53,12 @@ def main() -> int:
                         counts[outcome.kind] += 1
                         print(f"  {outcome.kind:8}{variant.name:58}{outcome.message[:200]}", flush=True)
                 shutil.rmtree(original_set.root)
+    if not counts:
+        fix = "name folders of data sets, and a word of a variant's name with `only`"
+        raise HyrfError(f"nothing was checked: {', '.join(map(str, options.sets))} --only '{options.only}'", fix=fix)
     print("\n" + ", ".join(f"{kind}: {count}" for kind, count in sorted(counts.items())))
     return 1 if counts["WRONG"] else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)
