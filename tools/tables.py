@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from hyrfpack.errors import HyrfError
+
+T = TypeVar("T")
 
 
 def markdown_row(cells: Sequence[str]) -> str:
@@ -19,6 +26,33 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]], ruler:
         ruler: one alignment marker for each column, such as "--:" for right-aligned; left-aligned without it.
     """
     return "\n".join(map(markdown_row, (columns, ruler or ["---"] * len(columns), *rows)))
+
+
+def print_measured_table(
+    columns: Sequence[str], subjects: Iterable[T], measure: Callable[[T], Iterable[Sequence[str]]]
+) -> None:
+    """Print a Markdown table, each row as soon as it is made; an error of a subject becomes its row.
+
+    Args:
+        columns: the column titles.
+        subjects: what is measured, such as data sets or files; the first cell of an error's row.
+        measure: yields the rows of one subject.
+    """
+    print(markdown_table(columns, []), flush=True)
+    for subject in subjects:
+        try:
+            for row in measure(subject):
+                print(markdown_row(row), flush=True)
+        except HyrfError as error:
+            print(markdown_row([str(subject), str(error), *[""] * (len(columns) - 2)]), flush=True)
+
+
+def merge_rows(path: Path, rows: Sequence[dict], keys: Sequence[str]) -> None:
+    """Add rows to a JSON file of rows; each replaces the one with the same values of `keys`."""
+    stored = json.loads(path.read_text()) if path.exists() else []
+    merged = {tuple(row.get(key) for key in keys): row for row in (*stored, *rows)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(list(merged.values()), indent=1))
 
 
 def format_cell(value: object) -> str:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import hyrfpack
 from hyrfpack.compress.calibrate import calibrate
-from hyrfpack.compress.distortion import default_distortion
+from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB, default_distortion
 from hyrfpack.compress.packer import EncodedCandidate, Packer
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.search import find_coarsest
@@ -110,20 +110,25 @@ class TrainedSet:
         start = time.perf_counter()
         return self.measure_file(encode_model(self.model, "paper", self.provenance), 0, start)
 
-    def compress_compact(self, distortion: float, steps: int = 0) -> MeasuredFile:
-        """Compress the model in profile compact as `hyrfpack compress` does, and measure the file."""
+    def compress_compact(self, distortion: float, steps: int = 0, target_drop: float | None = None) -> MeasuredFile:
+        """Compress the model in profile compact as `hyrfpack compress` does, and measure the file.
+
+        `target_drop` limits the loss on training photos, in dB, as the command does unless --distortion is given.
+        """
         start = time.perf_counter()
         sensitivity = calibrate(self.model, self.sensitivity, self.reference_renders, distortion)
         packer = Packer(self.model, self.provenance, sensitivity, self.scene, steps)
         candidate = (
-            packer.encode(distortion) if steps else packer.encode_to_distortion(distortion, self.reference_renders)
+            packer.encode(distortion)
+            if steps
+            else packer.encode_to_distortion(distortion, self.reference_renders, target_drop)
         )
         return self.measure_file(candidate.data, distortion, start, candidate)
 
     def measure(self, steps: int, matched: bool) -> dict:
         """Return the row of this data set."""
         distortion = default_distortion(self.provenance)
-        paper, default = self.compress_paper(), self.compress_compact(distortion)
+        paper, default = self.compress_paper(), self.compress_compact(distortion, target_drop=DEFAULT_PSNR_DROP_DB)
         row = {"set": self.name, "gaussians": len(self.model), "psnr": self.raw_scores[0], "ssim": self.raw_scores[1]}
         row |= {"measuring": self.sensitivity_seconds, "paper": paper, "default": default}
 

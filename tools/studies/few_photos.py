@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from hyrfpack.train.pilots import split
 from tools.command import run_command
 from tools.studies.set_variants import load_variant
 from tools.studies.train_sets import DATA_FOLDER
-from tools.tables import markdown_table
+from tools.tables import markdown_table, merge_rows
 
 VALIDATION_EVERY = 4
 MAX_TRAINING_VIEWS_SCORED = 8
@@ -73,18 +72,21 @@ def main() -> None:
     parser.add_argument("--folds", type=int, default=1, choices=range(1, VALIDATION_EVERY + 1))
     parser.add_argument("--no-exposure", dest="exposure", action="store_false", help="learn no per-image gains")
     parser.add_argument("--data", type=Path, default=DATA_FOLDER)
-    parser.add_argument("--out", type=Path, default=Path("runs/few_photos.json"), help="file for all scores")
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/few_photos.json"), help="file for all scores, also those of other calls"
+    )
     args = parser.parse_args()
-    rows, results = [], []
+    rows = []
     for name in args.sets:
         for fold in range(args.folds):
             scores = [train_and_score(args.data, name, fold, steps, args.exposure) for steps in args.steps]
             rows.append([name, str(fold), *map(str, scores)])
             print(" | ".join(rows[-1]), flush=True)
-            for steps, score in zip(args.steps, scores, strict=True):
-                results.append({"set": name, "fold": fold, "steps": steps, **dataclasses.asdict(score)})
-            args.out.parent.mkdir(parents=True, exist_ok=True)
-            args.out.write_text(json.dumps(results, indent=1))
+            results = [
+                {"set": name, "fold": fold, "steps": steps, "exposure": args.exposure, **dataclasses.asdict(score)}
+                for steps, score in zip(args.steps, scores, strict=True)
+            ]
+            merge_rows(args.out, results, keys=("set", "fold", "steps", "exposure"))
     print("\n" + markdown_table(["set", "fold", *(f"{steps:,} steps" for steps in args.steps)], rows))
 
 

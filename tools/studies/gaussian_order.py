@@ -18,6 +18,7 @@ import copy
 import dataclasses
 import statistics
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.density import spatial_order
 from tools.command import run_command
 from tools.studies.step_cost import resample_gaussians
-from tools.tables import markdown_table
+from tools.tables import print_measured_table
 
 MAX_PHOTOS = 6
 WARMUP_STEPS = 2  # The first steps compile kernels.
@@ -44,7 +45,7 @@ ROWS_PER_SECTOR = 4
 CELL_CORNER_OFFSETS = np.array([[corner >> axis & 1 for axis in range(3)] for corner in range(8)])
 
 
-def orders_of(model: HybridModel) -> dict[str, Tensor]:
+def make_orders(model: HybridModel) -> dict[str, Tensor]:
     """Return the compared orders (N,) int64 by name."""
     generator = torch.Generator().manual_seed(0)
     random = torch.randperm(len(model), generator=generator)
@@ -124,10 +125,11 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     scene = hyrfpack.load_scene(options.data)
     scene = dataclasses.replace(scene, train=scene.train[:MAX_PHOTOS], test=[])
-    rows = []
-    for count in options.gaussians:
+    header = ["Gaussians", "order", "CPU s a step", "ratio", "quartiles", "distinct rows", "distinct sectors"]
+
+    def measure(count: int) -> Iterator[list[str]]:
         model = resample_gaussians(hyrfpack.load_model(options.model), count)
-        models = {name: copy.deepcopy(model.subset(order)) for name, order in orders_of(model).items()}
+        models = {name: copy.deepcopy(model.subset(order)) for name, order in make_orders(model).items()}
         shares = {name: count_rows(ordered, scene) for name, ordered in models.items()}
         seconds = measure_steps(scene, models, options.steps)
         for name, values in seconds.items():
@@ -135,9 +137,9 @@ def main(arguments: list[str] | None = None) -> None:
             quartiles = " to ".join(f"{value:.3f}" for value in np.quantile(ratios, (0.25, 0.75)))
             median = f"{statistics.median(values):.4f}"
             counted = [f"{share:.3f}" for share in shares[name]]
-            rows.append([f"{count:,}", name, median, f"{np.median(ratios):.3f}", quartiles, *counted])
-    header = ["Gaussians", "order", "CPU s a step", "ratio", "quartiles", "distinct rows", "distinct sectors"]
-    print(markdown_table([*header, "runs, thread", "runs, block"], rows))
+            yield [f"{count:,}", name, median, f"{np.median(ratios):.3f}", quartiles, *counted]
+
+    print_measured_table([*header, "runs, thread", "runs, block"], options.gaussians, measure)
 
 
 if __name__ == "__main__":

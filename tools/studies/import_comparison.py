@@ -26,6 +26,7 @@ from pathlib import Path
 import gsply
 import numpy as np
 
+from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.format.codec import decode_model
 from hyrfpack.imports import ImportConfig
@@ -36,10 +37,11 @@ from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.formats import ply
 from hyrfpack.splats.splats import Splats
 from tools.command import run_command
-from tools.tables import markdown_table
+from tools.tables import print_measured_table
 
 NODE_FOLDER = Path(__file__).parents[2] / "tests" / "node"
 DEFAULT_PSNR_TARGETS_DB = (30, 32, 34, 36, 38, 40, 42, 45, 50)
+OWN_FILES, OTHER_FILES = "files of hyrfpack", "files of other programs"
 MIN_OPACITIES = (0.0, 0.05, 0.1)
 
 
@@ -105,14 +107,14 @@ def convert_with_splat_transform(source: Path, target: Path) -> None:
     """Convert a file of splats with splat-transform."""
     program = shutil.which("node")
     if program is None or not (NODE_FOLDER / "node_modules").is_dir():
-        raise SystemExit("splat-transform is not installed; install node and run 'npm ci --prefix tests/node'")
+        raise HyrfError("splat-transform is not installed", fix="install node and run 'npm ci --prefix tests/node'")
     job = json.dumps([[str(source), str(target)]])
     process = subprocess.run(
         [program, str(NODE_FOLDER / "convert.mjs"), job], capture_output=True, text=True, check=True
     )
     (error_text,) = json.loads(process.stdout.splitlines()[-1])
     if error_text:
-        raise SystemExit(f"splat-transform: {error_text}")
+        raise HyrfError(f"splat-transform: {error_text}", fix="check its installation in tests/node")
 
 
 def measure_splat_file(encoder: str, setting: str, file: Path, prepared: PreparedModel, seconds: float) -> MeasuredFile:
@@ -163,12 +165,21 @@ def main() -> None:
         prepared = prepare_model(splats, ImportConfig(size=args.size, seed=args.seed), name=str(file))
         print(f"\n{file.name}: {len(splats):,} Gaussians of degree {splats.degree}; "
               f"prepared in {time.perf_counter() - started:.0f} s\n")  # fmt: skip
-        own_files = list(measure_own_files(prepared, args.psnr))
-        with tempfile.TemporaryDirectory() as folder:
-            other_files = list(measure_other_files(splats, prepared, Path(folder)))
-        columns = ["encoder", "setting", "bytes", "dB, mean", "worst", "s"]
-        print(markdown_table(columns, [file.row() for file in (*own_files, *other_files)]), flush=True)
-        print("\nAt equal PSNR:\n", *compare_at_equal_psnr(own_files, other_files), sep="\n", flush=True)
+        files: dict[str, list[MeasuredFile]] = {OWN_FILES: [], OTHER_FILES: []}
+
+        def measure(kind: str, splats: Splats = splats, prepared: PreparedModel = prepared, files=files) -> Iterator:
+            with tempfile.TemporaryDirectory() as folder:
+                measured = (
+                    measure_own_files(prepared, args.psnr)
+                    if kind == OWN_FILES
+                    else measure_other_files(splats, prepared, Path(folder))
+                )
+                for made in measured:
+                    files[kind].append(made)
+                    yield made.row()
+
+        print_measured_table(["encoder", "setting", "bytes", "dB, mean", "worst", "s"], files, measure)
+        print("\nAt equal PSNR:\n", *compare_at_equal_psnr(*files.values()), sep="\n", flush=True)
 
 
 if __name__ == "__main__":

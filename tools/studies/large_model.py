@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import hyrfpack
@@ -18,7 +19,7 @@ from tools.browser.browser import Browser
 from tools.browser.chromium import Chromium
 from tools.command import run_command
 from tools.studies.web_player import PAGE_TIMEOUT_SECONDS, open_page
-from tools.tables import markdown_table
+from tools.tables import print_measured_table
 
 WINDOW_SIZE = (390, 844)
 # Counts the bytes of textures. Levels of detail, buffers and the canvas are not counted; the player has few of them.
@@ -54,12 +55,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", type=Path, nargs="+")
     arguments = parser.parse_args()
-    rows = []
-    for model in arguments.models:
+
+    def measure_model(model: Path) -> Iterator[list[str]]:
         with tempfile.TemporaryDirectory() as folder, Chromium(timeout_seconds=PAGE_TIMEOUT_SECONDS) as browser:
             browser.resize(*WINDOW_SIZE, phone=True)
-            rows.append(measure(browser, model, Path(folder) / "page.html"))
-    print(markdown_table(["Gaussians", "page bytes", "first s", "complete s", "textures MB"], rows))
+            yield measure(browser, model, Path(folder) / "page.html")
+
+    columns = ["Gaussians", "page bytes", "first s", "complete s", "textures MB"]
+    print_measured_table(columns, arguments.models, measure_model)
 
 
 if __name__ == "__main__":

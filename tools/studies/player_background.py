@@ -13,13 +13,14 @@ from __future__ import annotations
 import argparse
 import statistics
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import hyrfpack
 from tools.browser.chromium import Chromium
 from tools.command import run_command
 from tools.studies.web_player import PAGE_TIMEOUT_SECONDS, WINDOW_SIZE, open_page
-from tools.tables import markdown_table
+from tools.tables import print_measured_table
 
 # Returns [pixels between nodes, ms] of each evaluation. The first of each spacing warms up.
 TIMING_SCRIPT = """(async () => {
@@ -53,14 +54,16 @@ def main() -> None:
     parser.add_argument("models", type=Path, nargs="+")
     parser.add_argument("--repeats", type=int, default=5, help="evaluations with each spacing (5)")
     arguments = parser.parse_args()
-    rows = []
+    columns = ["model", "pixels between nodes", "each pixel, ms", "nodes, ms", "ratio"]
     with tempfile.TemporaryDirectory() as folder, Chromium(timeout_seconds=PAGE_TIMEOUT_SECONDS) as browser:
         browser.resize(*WINDOW_SIZE)
-        for model in arguments.models:
+
+        def measure(model: Path) -> Iterator[list[str]]:
             page = Path(folder) / "page.html"
             hyrfpack.export_model(model, page, overwrite=True)
-            rows.append([f"{model.parent.name}/{model.name}", *measure_model(browser, page, arguments.repeats)])
-    print(markdown_table(["model", "pixels between nodes", "each pixel, ms", "nodes, ms", "ratio"], rows))
+            yield [f"{model.parent.name}/{model.name}", *measure_model(browser, page, arguments.repeats)]
+
+        print_measured_table(columns, arguments.models, measure)
 
 
 if __name__ == "__main__":

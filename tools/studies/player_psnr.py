@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import statistics
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,7 +35,7 @@ from tools.studies.web_player import (
     read_from_page,
     stored_cameras,
 )
-from tools.tables import markdown_table
+from tools.tables import print_measured_table
 
 # From here on, pictures are those of frames at a part of the resolution, before they are enlarged, without what is
 # added at rest. The panorama has its final tiles in view, as after a rest at a view near this one. With
@@ -114,18 +114,19 @@ def main() -> None:
     parser.add_argument("--factor", type=int, default=2, help="moving frames have 1/N of the resolution (2)")
     parser.add_argument("--enlarge", type=int, nargs="+", default=[1], help="sizes of pictures in sizes of photos (1)")
     arguments = parser.parse_args()
-    rows = []
+    kinds = ("still", "moving", "moving, view's background")
+    columns = [f"{kind}, {statistic} dB" for kind in kinds for statistic in ("mean", "worst")]
     with tempfile.TemporaryDirectory() as folder, Chromium(timeout_seconds=PAGE_TIMEOUT_SECONDS) as browser:
         browser.resize(320, 200)  # pictures of cameras do not depend on the window
-        for model in arguments.models:
+
+        def measure_model(model: Path) -> Iterator[list[str]]:
             page = Path(folder) / "page.html"
             hyrfpack.export_model(model, page, overwrite=True)
             for enlarge in arguments.enlarge:
                 open_page(browser, page)
-                rows.append(measure_page(browser, model, arguments.views, arguments.factor, enlarge))
-    kinds = ("still", "moving", "moving, view's background")
-    columns = [f"{kind}, {statistic} dB" for kind in kinds for statistic in ("mean", "worst")]
-    print(markdown_table(["model", "Gaussians", "size", *columns], rows))
+                yield measure_page(browser, model, arguments.views, arguments.factor, enlarge)
+
+        print_measured_table(["model", "Gaussians", "size", *columns], arguments.models, measure_model)
 
 
 if __name__ == "__main__":

@@ -64,7 +64,8 @@ def describe_origin(data: Path, version: str | None = None, **settings: object) 
         version: the version that makes the result; None for this one.
         settings: what else the result depends on; values of JSON.
     """
-    return {"version": version or describe_own_version(), "data": str(data.resolve()), **settings}
+    origin = {"version": version or describe_own_version(), "data": str(data.resolve()), **settings}
+    return json.loads(json.dumps(origin))  # as it is read again, where tuples are lists
 
 
 def find_differences(folder: Path, origin: Origin) -> list[str]:

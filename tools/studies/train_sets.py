@@ -8,7 +8,7 @@
 The columns are PSNR in dB, SSIM, numbers of Gaussians, bytes, losses in dB, seconds of compression, training steps per
 second, training seconds, and ms per frame. Scores are those of the decoded files on held-out views (every 8th;
 Blender-style sets have their own split). Runs are kept in --out (runs/sets/<steps>), and --reuse only measures
-those. It refuses runs of another version, data set, --steps, --seed or --exposure.
+those. It refuses runs of another version, data set or configuration. A file table.json there has the rows of all sets.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from hyrfpack.train import TrainConfig
 from tools.command import run_command
 from tools.studies.reuse import ORIGIN_FILE, check_origin, describe_origin, write_origin
 from tools.studies.set_variants import load_variant
-from tools.tables import markdown_table
+from tools.tables import markdown_table, merge_rows
 
 COMPRESSED_PROFILES = ("paper", "compact")
 DATA_FOLDER = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[3] / "shared" / "data")
@@ -54,7 +54,7 @@ def measure(data: Path, name: str, out: Path, config: TrainConfig, reuse: bool) 
         HyrfError: with `reuse`, the run in `out` is of another version, data set or configuration.
     """
     scene = load_variant(data, name)
-    origin = describe_origin(data / name, steps=config.steps, seed=config.seed, exposure=config.exposure)
+    origin = describe_origin(data / name, **config.to_dict())
     if reuse and (out / "metrics.json").exists():
         check_origin(out, origin)
     else:
@@ -154,8 +154,7 @@ def main() -> None:
     for name in names:
         rows.append(measure(args.data, name, out / name, config, args.reuse))
         print(format_table(rows[-1:]).splitlines()[-1], flush=True)
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "table.json").write_text(json.dumps(rows, indent=1))
+        merge_rows(out / "table.json", rows[-1:], keys=("set",))
     print("\n" + format_table(rows))
 
 

@@ -31,7 +31,7 @@ from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train import TrainConfig
 from tools.command import run_command
 from tools.studies.train_sets import DATA_FOLDER
-from tools.tables import markdown_table
+from tools.tables import print_measured_table
 
 DEFAULT_SETS = ("ngp_fox", "drone_caliterra", "gerrard_hall")
 FRAMES_PER_SECOND = 10
@@ -56,8 +56,10 @@ def main() -> None:
     parser.add_argument("--train", action="store_true", help="also estimate poses and train")
     parser.add_argument("--steps", type=int, default=1000, help="training steps (1,000)")
     args = parser.parse_args()
-    rows = []
-    for name in args.sets:
+    header = ["set", "frames", "photos taken", "blurred taken", "repeated taken", "called blurred", "repeated", "s"]
+    header += ["dB, photos", "dB, video", "difference"] if args.train else []
+
+    def measure(name: str) -> Iterator[list[str]]:
         out = args.out / name
         if not (args.data / name / "images").is_dir():
             raise HyrfError(f"{args.data / name}: there is no folder images", fix="name the data sets with `data`")
@@ -65,15 +67,16 @@ def main() -> None:
         kinds = write_video(out / "clip.mp4", photos, args.lengths, args.quality, args.seed)
         started = time.perf_counter()
         report = choose_frames(out / "clip.mp4", out / "frames")
-        rows.append(format_row(name, kinds, out / "frames", report, time.perf_counter() - started))
+        row = format_row(name, kinds, out / "frames", report, time.perf_counter() - started)
         if args.train:
             photo_by_frame = dict(
                 enumerate(photos[number] for number in np.cumsum([kind == "photo" for kind in kinds]) - 1)
             )
             images, clip = args.data / name / "images", out / "clip.mp4"
-            rows[-1] += compare_training(images, clip, out, args.steps, photo_by_frame)
-    header = ["set", "frames", "photos taken", "blurred taken", "repeated taken", "called blurred", "repeated", "s"]
-    print(markdown_table(header + (["dB, photos", "dB, video", "difference"] if args.train else []), rows))
+            row += compare_training(images, clip, out, args.steps, photo_by_frame)
+        yield row
+
+    print_measured_table(header, args.sets, measure)
 
 
 def write_video(path: Path, photos: list[Path], lengths: tuple[float, float], quality: int, seed: int) -> list[str]:

@@ -31,7 +31,7 @@ from tools.browser.browser import Browser
 from tools.browser.chromium import Chromium
 from tools.command import run_command
 from tools.studies.train_sets import DATA_FOLDER
-from tools.tables import markdown_table
+from tools.tables import print_measured_table
 
 COMPARED_VIEWS = 8
 WINDOW_SIZE = (1280, 800)
@@ -159,14 +159,20 @@ def main() -> None:
             runs = [arguments.runs / name for name in arguments.sets or []] or sorted(
                 path.parent for path in arguments.runs.glob("*/compact.hyrf")
             )
-            rows = [measure_pictures(run, arguments.data / run.name, Path(folder)) for run in runs]
             columns = [
                 f"{name} {column}" for name in ("native", "baked") for column in ("bytes", "dB", "worst", "photos dB")
             ]
-            print(markdown_table(["set", ".hyrf bytes", *columns], rows))
-        rows = [row for model in arguments.large for row in measure_times(model, Path(folder), arguments.repeats)]
-        if rows:
-            print(markdown_table(["Gaussians", "page", "bytes", "first s", "complete s", "frame ms"], rows))
+            print_measured_table(
+                ["set", ".hyrf bytes", *columns],
+                runs,
+                lambda run: [measure_pictures(run, arguments.data / run.name, Path(folder))],
+            )
+        if arguments.large:
+            print_measured_table(
+                ["Gaussians", "page", "bytes", "first s", "complete s", "frame ms"],
+                arguments.large,
+                lambda model: measure_times(model, Path(folder), arguments.repeats),
+            )
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ import shutil
 import statistics
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ from tools.browser.chromium import WEBGPU_FLAGS, Chromium
 from tools.command import run_command
 from tools.studies.viewer_comparison import WINDOW_SIZE, Site
 from tools.studies.web_player import psnr
-from tools.tables import markdown_table
+from tools.tables import print_measured_table
 
 TIMEOUT_SECONDS = 900
 PAGE = """<!DOCTYPE html><link rel="icon" href="data:,"><style>html, body, div { height: 100%; margin: 0; }</style>
@@ -90,7 +91,7 @@ PIXELS_SCRIPT = """(() => {
 
 
 def measure(address: str, kind: str, repeats: int, count: int) -> tuple[list[str], np.ndarray]:
-    """Return the row of a renderer without its name, and its picture."""
+    """Return the row of a renderer without its name, and the colours (N, 3) in [0, 1] of its picture."""
     with Chromium(*WEBGPU_FLAGS, timeout_seconds=TIMEOUT_SECONDS) as browser:
         browser.resize(*WINDOW_SIZE)
         cpu, began = browser.cpu_seconds(), time.monotonic()
@@ -99,10 +100,10 @@ def measure(address: str, kind: str, repeats: int, count: int) -> tuple[list[str
             raise SystemExit("this Chromium does not draw with WebGPU")
         complete = [time.monotonic() - began, browser.cpu_seconds() - cpu]
         times = browser.evaluate(TIMING_SCRIPT % repeats)
-        pixels = np.frombuffer(browser.evaluate(PIXELS_SCRIPT).encode("latin-1"), np.uint8)
+        pixels = np.frombuffer(browser.evaluate(PIXELS_SCRIPT).encode("latin-1"), np.uint8).reshape(-1, 4)
     colors, frame, sort = (statistics.median(times[name]) for name in ("colors", "frame", "sort"))
     waits = [f"{value:.1f}" for value in complete]
-    return [*waits, f"{1000 * colors / count:.1f}", f"{frame:,.0f}", f"{sort:,.1f}"], pixels
+    return [*waits, f"{1000 * colors / count:.1f}", f"{frame:,.0f}", f"{sort:,.1f}"], pixels[:, :3] / 255
 
 
 def main() -> None:
@@ -110,23 +111,23 @@ def main() -> None:
     parser.add_argument("models", type=Path, nargs="+")
     parser.add_argument("--repeats", type=int, default=5, help="repetitions of each work (5)")
     arguments = parser.parse_args()
-    rows = []
+    columns = ["complete, s", "CPU, s", "colours, us", "frame, ms", "sort, ms", "PSNR, dB"]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         build_package(folder / "hyrf-viewer")
         (folder / "index.html").write_text(PAGE)
-        for model in arguments.models:
+
+        def measure_model(model: Path) -> Iterator[list[str]]:
             shutil.copy(model, folder / "scene.hyrf")
             count, pictures = len(hyrfpack.load_model(model)), []
             site = Site(folder)
             with site.run():
                 for kind in ("webgl", "webgpu"):
-                    row, pixels = measure(site.address, kind, arguments.repeats, count)
-                    rows.append([f"{count:,}", kind, *row, ""])
-                    pictures.append(pixels / 255)
-            rows[-1][-1] = f"{psnr(*pictures):.1f}"
-    columns = ["complete, s", "CPU, s", "colours, us", "frame, ms", "sort, ms", "PSNR, dB"]
-    print(markdown_table(["Gaussians", "renderer", *columns], rows))
+                    row, picture = measure(site.address, kind, arguments.repeats, count)
+                    pictures.append(picture)
+                    yield [f"{count:,}", kind, *row, f"{psnr(*pictures):.1f}" if len(pictures) == 2 else ""]
+
+        print_measured_table(["Gaussians", "renderer", *columns], arguments.models, measure_model)
 
 
 if __name__ == "__main__":
