@@ -44,9 +44,12 @@ def test_a_version_is_a_commit_with_its_changes(tmp_path: Path):
     names.append(describe_version(tmp_path))
     (tmp_path / "file").write_text("fifth")
     names.append(describe_version(tmp_path))
-    (tmp_path / "new").write_text("untracked")
+    (tmp_path / "results").touch()  # an untracked file that is no source
+    assert describe_version(tmp_path) == names[-1]
+    (tmp_path / "hyrfpack").mkdir()
+    (tmp_path / "hyrfpack" / "new.py").write_text("untracked")
     names.append(describe_version(tmp_path))
-    (tmp_path / "new").write_text("untracked, too")
+    (tmp_path / "hyrfpack" / "new.py").write_text("untracked, too")
     names.append(describe_version(tmp_path))
     assert len(set(names)) == len(names) == 9
     assert [("-dirty" in name) for name in names] == [False, True, False, True, False, True, True, True, True]

@@ -14,7 +14,7 @@ so one budget is enough for the change of bytes at equal PSNR:
     python -m tools.studies.compare_versions --against ../before --shares measured --sizes 1 0.7 0.5 0.35
 
 Runs are kept in --out and are not repeated while their data set, the version that trains them and its options stay
-the same. Their scores are kept while this version stays the same. Uncommitted changes and untracked files count as
+the same. Their scores are kept while this version stays the same. Uncommitted changes and untracked sources count as
 another version. The other version runs with the packages of this environment, and with --against-options for `train`.
 CPU seconds are without the compilation of kernels: each version first trains a few steps on the data set.
 """

@@ -145,6 +145,26 @@ def compare_at_equal_psnr(points: list[MeasuredFile], other_files: list[Measured
         yield f"- {other.encoder}, {other.setting}, {other.bytes:,} bytes, {other.psnr:.2f} dB: {comparison}"
 
 
+def compare_file(file: Path, config: ImportConfig, psnr_targets: list[float]) -> None:
+    """Print the table of one file of 3D Gaussians, and the ratios of bytes at equal PSNR."""
+    splats = read_splats(file)
+    started = time.perf_counter()
+    prepared = prepare_model(splats, config, name=str(file))
+    print(f"\n{file.name}: {len(splats):,} Gaussians of degree {splats.degree}; "
+          f"prepared in {time.perf_counter() - started:.0f} s\n")  # fmt: skip
+    files: dict[str, list[MeasuredFile]] = {OWN_FILES: [], OTHER_FILES: []}
+
+    def measure(kind: str) -> Iterator[list[str]]:
+        with tempfile.TemporaryDirectory() as folder:
+            others = measure_other_files(splats, prepared, Path(folder))
+            for made in measure_own_files(prepared, psnr_targets) if kind == OWN_FILES else others:
+                files[kind].append(made)
+                yield made.row()
+
+    print_measured_table(["encoder", "setting", "bytes", "dB, mean", "worst", "s"], files, measure)
+    print("\nAt equal PSNR:\n", *compare_at_equal_psnr(*files.values()), sep="\n", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", type=Path, nargs="+", help="files of 3D Gaussians")
@@ -160,26 +180,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     for file in args.files:
-        splats = read_splats(file)
-        started = time.perf_counter()
-        prepared = prepare_model(splats, ImportConfig(size=args.size, seed=args.seed), name=str(file))
-        print(f"\n{file.name}: {len(splats):,} Gaussians of degree {splats.degree}; "
-              f"prepared in {time.perf_counter() - started:.0f} s\n")  # fmt: skip
-        files: dict[str, list[MeasuredFile]] = {OWN_FILES: [], OTHER_FILES: []}
-
-        def measure(kind: str, splats: Splats = splats, prepared: PreparedModel = prepared, files=files) -> Iterator:
-            with tempfile.TemporaryDirectory() as folder:
-                measured = (
-                    measure_own_files(prepared, args.psnr)
-                    if kind == OWN_FILES
-                    else measure_other_files(splats, prepared, Path(folder))
-                )
-                for made in measured:
-                    files[kind].append(made)
-                    yield made.row()
-
-        print_measured_table(["encoder", "setting", "bytes", "dB, mean", "worst", "s"], files, measure)
-        print("\nAt equal PSNR:\n", *compare_at_equal_psnr(*files.values()), sep="\n", flush=True)
+        compare_file(file, ImportConfig(size=args.size, seed=args.seed), args.psnr)
 
 
 if __name__ == "__main__":

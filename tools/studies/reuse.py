@@ -14,12 +14,13 @@ from hyrfpack.errors import HyrfError
 REPOSITORY_ROOT = Path(__file__).parents[2]
 ORIGIN_FILE = "origin.json"
 DIGEST_CHARACTERS = 8
+SOURCE_FOLDERS = ("hyrfpack", "tools")  # Untracked files elsewhere may be results.
 
 Origin = dict[str, object]
 
 
 def describe_version(folder: Path) -> str:
-    """Return a name of the commit that a work tree holds, with a digest of its uncommitted changes and untracked files.
+    """Return a name of the commit that a work tree holds, with a digest of uncommitted changes and untracked sources.
 
     Raises:
         HyrfError: the folder is no work tree of git.
@@ -33,7 +34,7 @@ def describe_version(folder: Path) -> str:
         return process.stdout.strip()
 
     name = run_git("describe", "--always", "--abbrev=12")
-    listed = run_git("ls-files", "--others", "--exclude-standard", "-z").split("\0")
+    listed = run_git("ls-files", "--others", "--exclude-standard", "-z", "--", *SOURCE_FOLDERS).split("\0")
     untracked = [folder / path for path in sorted(listed) if (folder / path).is_file()]
     changes = run_git("diff", "HEAD")
     if changes or untracked:
