@@ -33,26 +33,39 @@ def run_git(folder: Path, *words: str) -> None:
 
 def test_a_version_is_a_commit_with_its_changes(tmp_path: Path):
     run_git(tmp_path, "init")
-    names = []
+    source, names = tmp_path / "hyrfpack" / "old.py", []
+    source.parent.mkdir()
     for text in ("first", "second", "third"):
-        (tmp_path / "file").write_text(text)
+        source.write_text(text)
         names += [describe_version(tmp_path)] if names else []
-        run_git(tmp_path, "add", "file")
+        run_git(tmp_path, "add", ".")
         run_git(tmp_path, "commit", "-m", text)
         names.append(describe_version(tmp_path))
-    (tmp_path / "file").write_text("fourth")
+    source.write_text("fourth")
     names.append(describe_version(tmp_path))
-    (tmp_path / "file").write_text("fifth")
+    source.write_text("fifth")
     names.append(describe_version(tmp_path))
-    (tmp_path / "results").touch()  # an untracked file that is no source
-    assert describe_version(tmp_path) == names[-1]
-    (tmp_path / "hyrfpack").mkdir()
     (tmp_path / "hyrfpack" / "new.py").write_text("untracked")
     names.append(describe_version(tmp_path))
     (tmp_path / "hyrfpack" / "new.py").write_text("untracked, too")
     names.append(describe_version(tmp_path))
     assert len(set(names)) == len(names) == 9
     assert [("-dirty" in name) for name in names] == [False, True, False, True, False, True, True, True, True]
+
+
+def test_files_that_are_no_sources_do_not_change_the_version(tmp_path: Path):
+    run_git(tmp_path, "init")
+    (tmp_path / "tools").mkdir()
+    (tmp_path / "tools" / "a.py").touch()
+    run_git(tmp_path, "add", ".")
+    run_git(tmp_path, "commit", "-m", "sources")
+    name = describe_version(tmp_path)
+    (tmp_path / "results").touch()
+    assert describe_version(tmp_path) == name
+    run_git(tmp_path, "add", ".")
+    run_git(tmp_path, "commit", "-m", "results")
+    (tmp_path / "results").write_text("others")
+    assert describe_version(tmp_path) == name
 
 
 def test_a_folder_that_is_no_work_tree_has_no_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

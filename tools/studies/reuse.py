@@ -14,13 +14,13 @@ from hyrfpack.errors import HyrfError
 REPOSITORY_ROOT = Path(__file__).parents[2]
 ORIGIN_FILE = "origin.json"
 DIGEST_CHARACTERS = 8
-SOURCE_FOLDERS = ("hyrfpack", "tools")  # Untracked files elsewhere may be results.
+SOURCE_FOLDERS = ("hyrfpack", "tools")  # Other files do not change results, or are results themselves.
 
 Origin = dict[str, object]
 
 
 def describe_version(folder: Path) -> str:
-    """Return a name of the commit that a work tree holds, with a digest of uncommitted changes and untracked sources.
+    """Return the last commit that changed the sources of a work tree, with a digest of what is not committed.
 
     Raises:
         HyrfError: the folder is no work tree of git.
@@ -33,10 +33,10 @@ def describe_version(folder: Path) -> str:
             raise HyrfError(problem, fix="make the folder with git worktree add")
         return process.stdout.strip()
 
-    name = run_git("describe", "--always", "--abbrev=12")
+    name = run_git("log", "-1", "--format=%h", "--abbrev=12", "--", *SOURCE_FOLDERS)
     listed = run_git("ls-files", "--others", "--exclude-standard", "-z", "--", *SOURCE_FOLDERS).split("\0")
     untracked = [folder / path for path in sorted(listed) if (folder / path).is_file()]
-    changes = run_git("diff", "HEAD")
+    changes = run_git("diff", "HEAD", "--", *SOURCE_FOLDERS)
     if changes or untracked:
         digest = hashlib.sha256(changes.encode())
         for path in untracked:
