@@ -268,7 +268,7 @@ class _BlockRun:
         """
         config, first = self.config, self.plan.blocks[0]
         if config.max_gaussians is not None or config.target_bytes is not None:
-            total, _ = budget_for(self.scene, self._with_bytes_of_one_block())
+            total, _ = budget_for(self.scene, config, len(self.plan.blocks) * PACKED_HEADER_BYTES)
             budget = max(1, round(total * block.point_count / len(self.scene.points)))
             config = dataclasses.replace(config, max_gaussians=budget, target_bytes=None)
         if block is first:
@@ -286,14 +286,6 @@ class _BlockRun:
             return None
         config = dataclasses.replace(config, exposure=exposure)
         return config if config.max_gaussians is not None else dataclasses.replace(config, budget_factor=factor)
-
-    def _with_bytes_of_one_block(self) -> TrainConfig:
-        """Return the settings with a target size less the decoders and headers of all blocks but one."""
-        target = self.config.target_bytes
-        if target is None:
-            return self.config
-        rest = target - (len(self.plan.blocks) - 1) * PACKED_HEADER_BYTES
-        return dataclasses.replace(self.config, target_bytes=max(1, rest))
 
     def _read_metrics(self, block: Block) -> dict:
         """Read the metrics of a finished block."""

@@ -41,6 +41,9 @@ MIN_BUDGET = 5_000
 # coarser numbers scores higher, down to about 5 bytes.
 PACKED_HEADER_BYTES = 8_000
 PACKED_BYTES_PER_GAUSSIAN = 5.0
+# In files smaller than this, decoders would take up to a third of the bytes. Narrow ones leave room for more Gaussians.
+MIN_WIDE_TARGET_BYTES = 30_000
+NARROW_WIDTH, PACKED_NARROW_HEADER_BYTES = 32, 5_000
 MIN_TARGETED_BUDGET = 250
 MAX_TARGETED_BUDGET_RATIO = 2  # The budget for a target size is at most this multiple of the usual one.
 GAUSSIANS_PER_ROW = 20  # Applies to each level of the radiance grid. The paper's models have 8 to 20.
@@ -77,26 +80,32 @@ def scene_frame(scene: Scene, preset: str) -> Frame:
     return Frame.from_box(low, high)
 
 
-def budget_for(scene: Scene, config: TrainConfig) -> tuple[int, str]:
+def budget_for(scene: Scene, config: TrainConfig, header_bytes: int | None = None) -> tuple[int, str]:
     """Return the Gaussian budget of a run and the reason in words.
 
     The usual budget (`usual_budget`) is multiplied by `config.budget_factor`. For a target size, the budget is the
-    number of Gaussians that fit, at most `MAX_TARGETED_BUDGET_RATIO` times the usual budget.
+    number of Gaussians that fit beside `header_bytes` of decoders and headers (None for those of one model), at most
+    `MAX_TARGETED_BUDGET_RATIO` times the usual budget.
     """
     if config.max_gaussians is not None:
         return config.max_gaussians, "asked for"
     budget = usual_budget_for(scene, config.steps)
     why = f"{count_pixels(scene):,} pixels in all, {config.steps:,} steps"
     if config.target_bytes is not None:
-        fitting = max(
-            MIN_TARGETED_BUDGET, round((config.target_bytes - PACKED_HEADER_BYTES) / PACKED_BYTES_PER_GAUSSIAN)
-        )
+        if header_bytes is None:
+            header_bytes = PACKED_NARROW_HEADER_BYTES if has_narrow_decoders(config) else PACKED_HEADER_BYTES
+        fitting = max(MIN_TARGETED_BUDGET, round((config.target_bytes - header_bytes) / PACKED_BYTES_PER_GAUSSIAN))
         if fitting <= MAX_TARGETED_BUDGET_RATIO * budget:
             return fitting, f"to be packed into {config.target_bytes:,} bytes"
         return MAX_TARGETED_BUDGET_RATIO * budget, f"{MAX_TARGETED_BUDGET_RATIO} times what suits {why}"
     if config.budget_factor not in (None, 1):
         return max(1, round(config.budget_factor * budget)), f"{config.budget_factor:g} times what suits {why}"
     return budget, why
+
+
+def has_narrow_decoders(config: TrainConfig) -> bool:
+    """Return whether decoders of half the usual width suit the target size."""
+    return config.target_bytes is not None and config.target_bytes < MIN_WIDE_TARGET_BYTES
 
 
 def check_has_photos(scene: Scene) -> None:
@@ -197,6 +206,7 @@ def build_model(
         solid=BACKGROUND_RGB[config.background_color],
         direction_encoding=config.direction_encoding,
         antialiased=config.antialiased,
+        hidden=NARROW_WIDTH if has_narrow_decoders(config) else ModelConfig.hidden,
     )
     cache = cache or PictureCache(0)
     color = first_color(scene, cache, np.array(model_config.solid, np.float32) if background else None)
@@ -211,6 +221,8 @@ def build_model(
         "background": f"{'sphere' if background else 'none'}: {why_background}",
         "initial_gaussians": f"{len(points):,}: {source}",
     }
+    if has_narrow_decoders(config):
+        choices["hidden"] = f"{NARROW_WIDTH}: the target size is below {MIN_WIDE_TARGET_BYTES:,} bytes"
     return model, budget, choices
 
 

@@ -18,6 +18,7 @@ from hyrfpack.train.setup import (
     MIN_TARGETED_BUDGET,
     PACKED_BYTES_PER_GAUSSIAN,
     PACKED_HEADER_BYTES,
+    PACKED_NARROW_HEADER_BYTES,
     budget_for,
     build_model,
     initial_points,
@@ -214,13 +215,25 @@ def test_a_budget_factor_multiplies_the_budget_by_pixels_and_steps(factor):
     assert found == (round(factor * usual), why if factor == 1 else f"{factor:g} times what suits {why}")
 
 
-@pytest.mark.parametrize("target", [22_000, 29_000, 36_000])
-def test_a_budget_for_a_target_size_fills_the_bytes_that_decoders_leave(target):
+@pytest.mark.parametrize(
+    "target, header",
+    [
+        (15_000, PACKED_NARROW_HEADER_BYTES),
+        (25_000, PACKED_NARROW_HEADER_BYTES),
+        (30_000, PACKED_HEADER_BYTES),
+        (36_000, PACKED_HEADER_BYTES),
+    ],
+)
+def test_a_budget_for_a_target_size_fills_the_bytes_that_decoders_leave(target, header):
     budget, reason = budget_for(around_an_object(), TrainConfig(target_bytes=target))
-    assert (budget, reason) == (
-        (target - PACKED_HEADER_BYTES) / PACKED_BYTES_PER_GAUSSIAN,
-        f"to be packed into {target:,} bytes",
-    )
+    assert (budget, reason) == ((target - header) / PACKED_BYTES_PER_GAUSSIAN, f"to be packed into {target:,} bytes")
+
+
+@pytest.mark.parametrize("target, hidden", [(29_999, 32), (30_000, 64), (None, 64)])
+def test_models_for_small_files_have_narrow_decoders(target, hidden):
+    config = TrainConfig(target_bytes=target, surface_points=False)
+    model, _, choices = build_model(ball_scene(views=3, points=30, side=12), config)
+    assert model.config.hidden == hidden and ("hidden" in choices) == (hidden == 32)
 
 
 def test_a_budget_for_a_target_size_is_limited_from_below_and_by_the_photos():
