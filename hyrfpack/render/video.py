@@ -9,12 +9,13 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from PIL import Image, UnidentifiedImageError
+
 from hyrfpack.atomic import pending_file
 from hyrfpack.errors import HyrfError
 
-# Both sides must be even, because chroma is stored at half resolution; ffmpeg adds a black row or column if needed.
 # Players read videos of 720 rows and more with the matrix of BT.709. Without it, ffmpeg would use that of BT.601.
-_FILTER = "pad=ceil(iw/2)*2:ceil(ih/2)*2:0:0,scale=out_color_matrix=bt709:out_range=tv,format=yuv420p"
+_COLOR_FILTER = "scale=out_color_matrix=bt709:out_range=tv,format=yuv420p"
 _COLOR_TAGS = {"colorspace": "bt709", "color_primaries": "bt709", "color_trc": "iec61966-2-1", "color_range": "tv"}
 
 
@@ -29,7 +30,7 @@ def write_video(
     """Encode PNG files as an MP4 video, which is written completely or not at all.
 
     Args:
-        frames: PNG files in order; those of another size than the first are scaled to its size.
+        frames: PNG files in order; those of another size than the first are fitted into its size, between black bars.
         path: the .mp4 file to write, in an existing folder.
         frames_per_second: frame rate of the video.
         overwrite: replace a file at `path`; without it, a free file name in the same folder is used.
@@ -53,7 +54,7 @@ def write_video(
         "-i",
         "-",
         "-vf",
-        _FILTER,
+        f"{_fit_filter(frames[0])},{_COLOR_FILTER}",
         *(word for name, value in _COLOR_TAGS.items() for word in (f"-{name}", value)),
         "-movflags",
         "+faststart",
@@ -82,3 +83,17 @@ def write_video(
                 fix="use the pictures, which are written",
             )
     return pending.path
+
+
+def _fit_filter(first: Path) -> str:
+    """Return ffmpeg's filter that fits each frame into the size of the first.
+
+    Both sides must be even, because chroma is stored at half resolution; a black row or column is added if needed.
+    """
+    try:
+        with Image.open(first) as picture:
+            width, height = picture.size
+    except UnidentifiedImageError:
+        return "null"  # ffmpeg says what is wrong with the file
+    size = f"{width + width % 2}:{height + height % 2}"
+    return f"scale={width}:{height}:force_original_aspect_ratio=decrease,pad={size}:(ow-iw)/2:(oh-ih)/2"

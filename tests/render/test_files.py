@@ -136,3 +136,18 @@ def test_a_video_without_ffmpeg_is_a_clear_error(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(HyrfError, match="no ffmpeg program"):
         write_video([], tmp_path / "video.mp4")
+
+
+@pytest.mark.integration
+@pytest.mark.skipif(not has_ffmpeg(), reason="needs ffmpeg")
+def test_frames_of_another_shape_are_fitted_into_a_video_without_distortion(tmp_path):
+    av = pytest.importorskip("av")
+    for name, width, height in (("wide", 201, 100), ("high", 100, 200)):
+        Image.new("RGB", (width, height), "white").save(tmp_path / f"{name}.png")
+    frames = [tmp_path / "wide.png", tmp_path / "high.png"]
+    with av.open(str(write_video(frames, tmp_path / "video.mp4"))) as video:
+        wide, high = (frame.to_ndarray(format="gray") > 128 for frame in video.decode(video=0))
+    assert wide.shape == high.shape == (100, 202)
+    assert wide[:, :201].mean() > 0.99 and wide[:, 201].mean() < 0.1
+    columns = np.flatnonzero(high.mean(0) > 0.5)
+    assert abs(len(columns) - 50) <= 2 and abs(columns.mean() - 100.5) <= 2 and high[:, columns[2:-2]].all()
