@@ -160,7 +160,7 @@ def _export_file(
         if kind is HTML_PAGE and not config.baked:
             return write_native_page(loaded, source, target, config, overwrite)
         if kind in (TRANSFORMS_JSON, COLMAP_FOLDER):
-            _check_cameras(loaded, source, data)
+            _check_cameras(loaded, model, data)
         if kind is TRANSFORMS_JSON:
             return _write_cameras(loaded, target, data, overwrite)
         if kind is COLMAP_FOLDER and data is not None and data.train:

@@ -122,6 +122,15 @@ def test_no_note_names_the_temporary_file_of_a_scene_folder(target, tmp_path, ca
     assert caplog.messages == []
 
 
+def test_messages_about_cameras_name_the_scene_folder(tmp_path, caplog):
+    try:
+        export_model(GOLDEN_SCENE, tmp_path / "a.json")
+        messages = "\n".join(caplog.messages)
+    except HyrfError as error:
+        messages = str(error)
+    assert messages.startswith(str(GOLDEN_SCENE))
+
+
 def test_other_files_in_the_folder_are_kept(model_file, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     for _ in range(2):
