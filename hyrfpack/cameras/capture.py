@@ -35,7 +35,9 @@ PSNR_BEFORE_KEY = "psnr_before"
 PSNR_BEFORE_COMPRESSION = "compression"
 PSNR_BEFORE_EDIT = "an edit"
 
-MISMATCH_REMEDY = "name the photos and poses that it was trained on"
+MISMATCH_REMEDY = (
+    "name the photos and poses that it was trained on; if an edit moved the model, use it as it was before the move"
+)
 # A stored camera matches a photo's camera that differs from it by no more than these two limits.
 _MAX_MATCH_DISTANCE_SCENE_SCALES = 5 / COARSE_POSE_STEPS_PER_SCENE_SCALE
 _MAX_MATCH_ANGLE_DEGREES = 3.0

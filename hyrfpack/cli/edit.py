@@ -250,7 +250,11 @@ def edit(
     from hyrfpack.format import describe_file
 
     model = resolve_model_file(model)
-    scene = None if data is None else read_scene(data, reader_options, describe_file(model), must_match=True)
+    scene = None
+    if data is not None:
+        facts = describe_file(model)
+        edited = next((each for each in facts.get("parts", []) if each["name"] == part), facts)
+        scene = read_scene(data, reader_options, edited, must_match=True)
     if plan:
         report = plan_edit(model, actions, part=part, data=scene, picture=picture, overwrite=overwrite)
     else:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.cameras.capture import PSNR_BEFORE_EDIT, PSNR_BEFORE_KEY, Capture, has_mean_exposure
+from hyrfpack.cameras.capture import MISMATCH_REMEDY, PSNR_BEFORE_EDIT, PSNR_BEFORE_KEY, Capture, has_mean_exposure
 from hyrfpack.cameras.paths import estimate_up
 from hyrfpack.config.edit import Action, Background, Center, Crop, EstimateUp, Move, Refit, Remove, Up, Upright
 from hyrfpack.edit.refit import refit, score_region
@@ -20,7 +20,7 @@ from hyrfpack.edit.report import ActionReport
 from hyrfpack.edit.select import keep_mask
 from hyrfpack.edit.state import EditState
 from hyrfpack.edit.transform import Placement, replace_config, unit_vector
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.format.container import Container
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.part_names import open_parts
@@ -109,6 +109,7 @@ def open_scene(path: Path, source: Path, data: Scene | None, progress: Progress)
 
     Raises:
         HyrfError: the file cannot be read, or holds no Gaussian.
+        HyrfDataError: the photos do not belong to the model, or to the first one of a merged file.
     """
     with Container.open(path, SECTION_CONTENTS) as container:
         files = open_parts(container) if PART_NAMES in container.entries else [("", container)]
@@ -125,6 +126,8 @@ def open_scene(path: Path, source: Path, data: Scene | None, progress: Progress)
     }
     scene = parts[0]
     capture = captures[scene.name]
+    if mismatch := Capture(capture.facts, data).mismatch:
+        raise HyrfDataError(mismatch, fix=MISMATCH_REMEDY)
     state = EditState(
         source,
         captures,

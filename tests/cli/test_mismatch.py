@@ -12,6 +12,8 @@ from scenes import small_model
 
 import hyrfpack
 from hyrfpack.cameras.capture import scene_provenance
+from hyrfpack.config.edit import MinOpacity
+from hyrfpack.errors import HyrfDataError
 
 MISMATCH_NOTE = "another coordinate frame; name the photos and poses that it was trained on"
 
@@ -68,3 +70,26 @@ def test_commands_that_fit_or_choose_by_photos_refuse_other_ones(
     name, *options = command.split()
     message = refused(name, model, "-o", tmp_path / output, *options, "--data", data_in_another_frame)
     assert MISMATCH_NOTE in message and not (tmp_path / output).exists()
+
+
+def test_python_refuses_to_edit_with_photos_of_another_frame(model, data_in_another_frame, tmp_path):
+    photos = hyrfpack.load_scene(data_in_another_frame)
+    with pytest.raises(HyrfDataError, match="another coordinate frame"):
+        hyrfpack.plan_edit(model, [MinOpacity(0.1)], data=photos)
+    with pytest.raises(HyrfDataError, match="another coordinate frame"):
+        hyrfpack.edit_model(model, tmp_path / "x.hyrf", [MinOpacity(0.1)], data=photos)
+
+
+def test_photos_of_the_edited_part_of_a_merged_file_are_accepted_and_others_are_refused(
+    model, data, data_in_another_frame, tmp_path
+):
+    moved = hyrfpack.load_scene(data_in_another_frame)
+    other = tmp_path / "other.hyrf"
+    hyrfpack.save_model(small_model([[0.0, 0.0, 0.0]]), other, provenance=scene_provenance(moved))
+    merged = tmp_path / "merged.hyrf"
+    succeeded("merge", other, model, "-o", merged)
+    command = ["edit", merged, "--plan", "--min-opacity", "0.001", "--part"]
+    succeeded(*command, "model", "--data", data)
+    succeeded(*command, "other", "--data", data_in_another_frame)
+    assert "another coordinate frame" in refused(*command, "model", "--data", data_in_another_frame)
+    assert "another coordinate frame" in refused(*command, "other", "--data", data)
