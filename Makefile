@@ -86,7 +86,7 @@ bench: $(VENV_STAMP) ## time each hot operation at several sizes against its ref
 gpu: $(VENV_STAMP) ## check and measure the GPU kernels on this machine's GPU; results in docs/gpu/ (at most 9 minutes)
 	$(BIN)/python -m tools.gpu.check
 
-speed: $(VENV_STAMP) ## measure time and error of every setting on a small model; plot in runs/speed.png (2 to 4 minutes)
+speed: $(VENV_STAMP) ## measure time and error of every setting on a small model; plot in runs/speed.png (some minutes)
 	$(BIN)/hyrfpack bench -o runs/speed.png
 
 sets: $(VENV_STAMP) ## train every real data set for 1,000 steps and print a table (10 minutes)
