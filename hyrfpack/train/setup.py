@@ -206,8 +206,9 @@ def build_model(
         solid=BACKGROUND_RGB[config.background_color],
         direction_encoding=config.direction_encoding,
         antialiased=config.antialiased,
-        hidden=NARROW_WIDTH if has_narrow_decoders(config) else ModelConfig.hidden,
     )
+    if has_narrow_decoders(config):
+        model_config = replace(model_config, hidden=NARROW_WIDTH)
     cache = cache or PictureCache(0)
     color = first_color(scene, cache, np.array(model_config.solid, np.float32) if background else None)
     pictures = cache if config.surface_points else None
