@@ -6,13 +6,12 @@ import json
 import sys
 
 import hyrfpack
-from hyrfpack.demo.scene import write_demo_scene
-from tools.safety.train_golden import DEMO_COMPACT_FILE, DEMO_MODEL_FILE
+from tools.safety.train_golden import DEMO_COMPACT_FILE, DEMO_MODEL_FILE, write_demo_photos
 from tools.studies import format_comparison
 
 
 def test_the_command_measures_profiles_given_files_and_other_formats(tmp_path, monkeypatch, capsys):
-    data = write_demo_scene(tmp_path / "demo", views=9, size=24)
+    data = write_demo_photos(tmp_path / "demo")
     monkeypatch.setattr(format_comparison, "SH_DEGREES", (0,))
     monkeypatch.setattr(format_comparison, "MIN_OPACITIES", (0.0,))
     monkeypatch.setattr(format_comparison, "PROFILE_SETTINGS", {})
