@@ -113,6 +113,13 @@ def test_a_result_of_another_origin_is_refused_or_removed(data, version, setting
     check_origin(folder, origin)
 
 
+def test_files_without_an_origin_are_never_removed(tmp_path):
+    (tmp_path / "photo.jpg").touch()
+    with pytest.raises(HyrfError, match="it has files but no origin.json"):
+        remove_outdated(tmp_path, describe_origin(tmp_path, "first"))
+    assert [path.name for path in tmp_path.iterdir()] == ["photo.jpg"]
+
+
 def test_a_result_without_an_origin_is_refused(tmp_path):
     with pytest.raises(HyrfError, match="no origin.json"):
         check_origin(tmp_path, describe_origin(tmp_path, "first"))

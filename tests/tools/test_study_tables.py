@@ -121,7 +121,7 @@ def test_the_player_with_webgpu_is_compared_by_rgb_alone(monkeypatch):
             return 0.0
 
         def evaluate(self, script: str):
-            if script == webgpu_player.SETTLED_SCRIPT:
+            if script == webgpu_player.COMPLETE_PICTURE_SCRIPT:
                 return False
             if script == webgpu_player.PIXELS_SCRIPT:
                 return next(remaining).tobytes().decode("latin-1")

@@ -145,21 +145,24 @@ def compare_at_equal_psnr(points: list[MeasuredFile], other_files: list[Measured
         yield f"- {other.encoder}, {other.setting}, {other.bytes:,} bytes, {other.psnr:.2f} dB: {comparison}"
 
 
-def compare_file(file: Path, config: ImportConfig, psnr_targets: list[float]) -> None:
+def compare_file(path: Path, config: ImportConfig, psnr_targets: list[float]) -> None:
     """Print the table of one file of 3D Gaussians, and the ratios of bytes at equal PSNR."""
-    splats = read_splats(file)
+    splats = read_splats(path)
     started = time.perf_counter()
-    prepared = prepare_model(splats, config, name=str(file))
-    print(f"\n{file.name}: {len(splats):,} Gaussians of degree {splats.degree}; "
+    prepared = prepare_model(splats, config, name=str(path))
+    print(f"\n{path.name}: {len(splats):,} Gaussians of degree {splats.degree}; "
           f"prepared in {time.perf_counter() - started:.0f} s\n")  # fmt: skip
     files: dict[str, list[MeasuredFile]] = {OWN_FILES: [], OTHER_FILES: []}
 
     def measure(kind: str) -> Iterator[list[str]]:
         with tempfile.TemporaryDirectory() as folder:
-            others = measure_other_files(splats, prepared, Path(folder))
-            for made in measure_own_files(prepared, psnr_targets) if kind == OWN_FILES else others:
-                files[kind].append(made)
-                yield made.row()
+            if kind == OWN_FILES:
+                measured = measure_own_files(prepared, psnr_targets)
+            else:
+                measured = measure_other_files(splats, prepared, Path(folder))
+            for file in measured:
+                files[kind].append(file)
+                yield file.row()
 
     print_measured_table(["encoder", "setting", "bytes", "dB, mean", "worst", "s"], files, measure)
     print("\nAt equal PSNR:\n", *compare_at_equal_psnr(*files.values()), sep="\n", flush=True)

@@ -91,7 +91,13 @@ def check_origin(folder: Path, origin: Origin) -> None:
 
 
 def remove_outdated(folder: Path, origin: Origin) -> None:
-    """Remove a folder whose result has another origin, and store `origin` in a folder that is new or was removed."""
+    """Remove a folder whose result has another origin, and store `origin` in a folder that is new or was removed.
+
+    Raises:
+        HyrfError: the folder has files but no origin, so that they may be anyone's.
+    """
+    if folder.exists() and any(folder.iterdir()) and not (folder / ORIGIN_FILE).exists():
+        raise HyrfError(f"{folder}: it has files but no {ORIGIN_FILE}", fix="name another folder, or remove this one")
     if find_differences(folder, origin):
         shutil.rmtree(folder, ignore_errors=True)
         write_origin(folder, origin)

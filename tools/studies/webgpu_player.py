@@ -45,7 +45,7 @@ const renderer = location.hash === "#webgpu" ? { renderer: webgpu } : {};
 window.viewer = createViewer({ container: "#scene", src: "scene.hyrf", interaction: "none", ...renderer });
 </script>
 """
-SETTLED_SCRIPT = """(async () => {
+COMPLETE_PICTURE_SCRIPT = """(async () => {
   while (!window.viewer?.isReady) await new Promise((resolve) => setTimeout(resolve, 20));
   await viewer.player.settled;
   return Boolean(viewer.player.renderer.isOnDevice);
@@ -96,7 +96,7 @@ def measure(address: str, kind: str, repeats: int, count: int) -> tuple[list[str
         browser.resize(*WINDOW_SIZE)
         cpu, began = browser.cpu_seconds(), time.monotonic()
         browser.open(f"{address}/index.html#{kind}")
-        if browser.evaluate(SETTLED_SCRIPT) != (kind == "webgpu"):
+        if browser.evaluate(COMPLETE_PICTURE_SCRIPT) != (kind == "webgpu"):
             raise SystemExit("this Chromium does not draw with WebGPU")
         complete = [time.monotonic() - began, browser.cpu_seconds() - cpu]
         times = browser.evaluate(TIMING_SCRIPT % repeats)
