@@ -101,6 +101,7 @@ def asked() -> WorkCounts:
     return count_step_work(points=20, side=8)
 
 
+@pytest.mark.acceptance
 def test_a_step_has_at_most_127_launches(asked: WorkCounts) -> None:
     assert count_kind(asked, "launch") <= MAX_STEP_LAUNCHES, (
         f"{count_kind(asked, 'launch')} launches:\n{format_counts(asked)}"

@@ -183,6 +183,7 @@ def coded_model(quick_calibration: None) -> tuple[HybridModel, dict[str, dict]]:
     return model, rows_by_setting(codec_rows(make_subject(model), 1, []))
 
 
+@pytest.mark.acceptance
 def test_raw_is_the_exact_codec_and_bytes_are_those_of_the_file(coded_model):
     model, rows = coded_model
     raw, paper = rows["profile"]["raw"], rows["profile"]["paper"]
@@ -274,6 +275,7 @@ def test_parameters_of_another_number_of_gaussians_are_not_compared():
     }
 
 
+@pytest.mark.acceptance
 def test_a_profile_that_cannot_write_the_model_is_omitted_with_the_reason():
     model = make_model()
     with torch.no_grad():

@@ -95,6 +95,7 @@ def test_compress_reports_the_bytes_on_disk(profile, run, tmp_path):
     assert sum(section["after"] for section in report["sections"]) < report["bytes_after"]
 
 
+@pytest.mark.acceptance
 def test_compact_is_the_default_and_smaller_than_the_paper_profile(run, packed, tmp_path):
     report = json.loads(succeeded("compress", run / "model.hyrf", "-o", tmp_path / "p.hyrf", "--json").stdout)
     assert report["bytes_after"] == (tmp_path / "p.hyrf").stat().st_size

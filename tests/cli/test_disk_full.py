@@ -211,6 +211,7 @@ def balls_with_counted_loads(before_load=lambda count: None):
     return dataclasses.replace(scene, train=[watched(view) for view in scene.train])
 
 
+@pytest.mark.acceptance
 def test_a_disk_that_fills_in_training_keeps_the_checkpoint_and_resumes_to_the_same_model(disk):
     whole = Trainer(balls_with_counted_loads(), SHORT_CONFIG)
     whole.run()

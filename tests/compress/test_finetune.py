@@ -59,6 +59,7 @@ def encode_and_decode(
     return decode_model(data), len(data)
 
 
+@pytest.mark.acceptance
 def test_finetuning_gains_more_psnr_than_finer_steps_of_the_same_size(trained_model, plan, sensitivity, scene):
     finer = encode_model(
         trained_model, "compact", quantized=plan_and_quantize(trained_model, sensitivity, COARSE_DISTORTION / 3)

@@ -304,6 +304,7 @@ def test_estimates_of_no_gaussian_are_empty():
     assert combine_with_prior(none.astype(np.int64), none, none, 4).shape == (0,)
 
 
+@pytest.mark.acceptance
 @needs_triton
 @pytest.mark.skipif(not IS_INTERPRETED, reason="the transfers of a fake GPU are counted")
 def test_a_gpu_draws_signs_itself_and_accumulates_squares(monkeypatch):

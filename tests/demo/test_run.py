@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
+
 import hyrfpack
 from hyrfpack.demo import run as demo
 
 
+@pytest.mark.acceptance
 def test_the_demo_reports_the_steps_that_were_taken(tmp_path, monkeypatch):
     train = demo.train_model
 

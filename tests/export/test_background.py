@@ -68,6 +68,7 @@ def test_background_splats_are_denser_where_cameras_look():
     assert len(background_splats(model, [])) <= 1000
 
 
+@pytest.mark.acceptance
 @torch.no_grad()
 def test_cells_add_up_the_light_that_all_cameras_see():
     model, camera = sky_model(), camera_at((0, -3, 0))

@@ -259,6 +259,7 @@ def test_a_group_may_have_16_stages_but_not_17():
         encode_model(model, "paper", color=(17, 2))
 
 
+@pytest.mark.acceptance
 def test_forged_exposure_maps_trigger_every_check_of_the_reader():
     """The forged maps produce each error message of codec 9, and some are decoded."""
     outcomes = Counter()

@@ -16,7 +16,6 @@ import pytest
 import torch
 from commands import hyrfpack, refused, succeeded
 from json_schema import matches
-from layers import only_in_acceptance
 from scenes import ball_scene, ring, shift_cameras, small_model
 
 from hyrfpack.cameras.capture import Capture, provenance_cameras
@@ -120,7 +119,8 @@ def test_the_finest_levels_of_a_raw_file_have_its_very_numbers(tmp_path):
     assert Counter(row.tobytes() for row in rows[0]) == Counter(row.tobytes() for row in rows[1])
 
 
-@pytest.mark.parametrize("profile", only_in_acceptance(["compact", "raw"], ["raw"]))
+@pytest.mark.acceptance
+@pytest.mark.parametrize("profile", ["compact", "raw"])
 def test_chunks_keep_residuals_exactly_and_merged_gaussians_have_their_own(tmp_path, monkeypatch, profile):
     source = GOLDEN_FOLDER / "v1.6_compact_residuals.hyrf"
     if profile == "raw":

@@ -79,6 +79,7 @@ def test_rounding_makes_no_intercept_of_a_linear_fit_negative():
         assert intercept >= 0
 
 
+@pytest.mark.acceptance
 def test_measuring_a_scene_gives_its_cost(scene):
     cost = minutes.measure_scene_cost(scene, make_plan(), CPU_DEVICE, 0, PictureCache(), 5.0)
     assert (

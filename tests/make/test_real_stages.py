@@ -46,6 +46,7 @@ def finished_work(reports, posed, tmp_path_factory) -> Path:
     ).work
 
 
+@pytest.mark.acceptance
 def test_every_stage_reports_its_progress_and_the_remaining_time(finished_work, reports):
     assert list(dict.fromkeys(progress.stage for progress in reports)) == [
         "training", "compression", "scoring", "export"
@@ -65,6 +66,7 @@ def test_a_stop_asked_by_the_context_leaves_a_preview(posed, tmp_path):
     assert stopped.value.preview == tmp_path / "scene.work" / "preview.hyrf" and stopped.value.preview.is_file()
 
 
+@pytest.mark.acceptance
 def test_an_interrupted_command_resumes_from_its_checkpoint_to_the_same_products(
     finished_work, posed, tmp_path, monkeypatch, signals
 ):

@@ -126,6 +126,7 @@ def test_thin_solids_stay_closed_after_any_reduction(seed, count):
 # -- proxies ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.acceptance
 def test_a_sheet_becomes_a_slab_whose_front_is_the_sheet():
     vertices, faces = sheet(1.0, 0.0125)
     proxy = make_proxy(vertices, faces, 0.00625, 300)
@@ -161,6 +162,7 @@ def test_a_closed_sphere_becomes_solid_without_its_cavity():
     assert mesh.body_count == 1 and mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.01)
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("quick_distances")
 def test_narrow_gaps_are_filled_and_wide_ones_stay():
     vertices, faces = sheet(1.0, 0.0125)

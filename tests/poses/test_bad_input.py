@@ -107,6 +107,7 @@ def test_photos_without_overlap_are_a_clear_error(tmp_path):
     assert (tmp_path / "scene" / ".poses" / "database.db").is_file()
 
 
+@pytest.mark.acceptance
 def test_photos_from_one_place_are_a_clear_error(tmp_path):
     textures, pose = wall_textures(), arc_pose(0.5)
     pictures = []

@@ -93,6 +93,7 @@ def frame_numbers(folder: Path) -> list[int]:
     return sorted(int(path.stem.removeprefix("frame_")) for path in folder.glob("*.jpg"))
 
 
+@pytest.mark.acceptance
 def test_blurred_and_repeated_frames_are_never_chosen(wall, tmp_path):
     """Every third frame is blurred and every fourth repeated; the camera moves by 1.5 % of the width per frame."""
     frames, kinds, places = [], [], []
@@ -388,6 +389,7 @@ def test_an_omitted_frame_is_named_with_its_time(wall, tmp_path):
     assert estimation._user_name(job.names[5]) == f"{job.names[5]} (at {number / 30:.1f} s)"
 
 
+@pytest.mark.acceptance
 def test_a_360_degree_video_is_refused_by_its_own_name(tmp_path):
     panorama = render_panorama(arc_pose(0.5), wall_textures())
     frames = [np.roll(panorama, 4 * number, axis=1) for number in range(20)]

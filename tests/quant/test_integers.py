@@ -131,6 +131,7 @@ def test_empty_array_takes_no_bytes_and_equal_values_take_three() -> None:
     assert len(encode_integers(np.full(10**6, -7), signed=True)) == 3
 
 
+@pytest.mark.acceptance
 def test_decoding_takes_little_memory_beyond_its_output_and_input() -> None:
     values = np.rint(np.random.default_rng(3).laplace(scale=2, size=2_000_000)).astype(np.int32)
     contexts = np.zeros(len(values), np.uint8)

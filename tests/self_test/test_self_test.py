@@ -109,6 +109,7 @@ def test_all_cpu_kernels_pass_in_a_child_process() -> None:
     assert not test.failed_rows and len(test.rows) == sum(case.has_cpu_kernels for case in ALL_CASES.values())
 
 
+@pytest.mark.acceptance
 @needs_triton
 @needs_interpreter
 def test_a_kernel_that_crashes_and_a_wrong_one_are_found_and_another_still_runs() -> None:

@@ -154,6 +154,7 @@ def test_a_run_takes_the_budget_of_its_pilots_and_records_the_reason(tmp_path, m
     assert f"Gaussian budget: {reason}" in caplog.messages
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("short_pilots", "signals")
 def test_a_run_that_continues_keeps_its_budget_and_the_reason(tmp_path, monkeypatch):
     config = TrainConfig(steps=10)

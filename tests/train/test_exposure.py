@@ -221,6 +221,7 @@ def test_too_few_points_to_compare_photos_are_not_reported_as_equal_exposures():
     assert trainer.choices["exposure"] == "per-image gains; too few tracks show the photos' exposures"
 
 
+@pytest.mark.acceptance
 def test_an_interrupted_run_continues_to_the_same_bytes(tmp_path):
     scene, path = exposed_scene(alternating_gains(6)), tmp_path / "checkpoint.pt"
     whole, first = train_trainer(scene), Trainer(scene, SHORT_CONFIG)

@@ -192,6 +192,7 @@ def test_training_reduces_photos_and_renders_at_their_size() -> None:
     assert all(np.isfinite(record["loss"]) for record in trainer.records)
 
 
+@pytest.mark.acceptance
 def test_a_resumed_run_takes_the_same_steps_when_the_resolution_changes(tmp_path, monkeypatch) -> None:
     side = 64
     monkeypatch.setattr(resolution, "MIN_REDUCED_SIDE_PIXELS", side // 2)

@@ -115,22 +115,18 @@ def final_state(scene: Scene, config: TrainConfig, device: torch.device, *, grap
     return trainer._tensors() | observed | {"reports": torch.tensor(reports)}
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize(
     "change",
     [
         "masks, exposure compensation and a round of density control",
-        *(
-            pytest.param(change, marks=pytest.mark.acceptance)
-            for change in (
-                "nothing",
-                "masks",
-                "photos of two sizes",
-                "exposure compensation",
-                "random background colours",
-                "rounds of density control",
-                "antialiasing",
-            )
-        ),
+        "nothing",
+        "masks",
+        "photos of two sizes",
+        "exposure compensation",
+        "random background colours",
+        "rounds of density control",
+        "antialiasing",
     ],
 )
 def test_replayed_steps_have_the_bits_of_launched_ones(gpu: torch.device, replays: list[int], change: str) -> None:

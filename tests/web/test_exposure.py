@@ -326,10 +326,7 @@ def test_scripts_cannot_set_an_unknown_exposure(browser: Browser, tmp_path: Path
 
 @pytest.mark.acceptance
 @pytest.mark.in_turn
-@pytest.mark.parametrize(
-    "exposure",
-    [pytest.param(name, marks=[pytest.mark.smoke] if name == CONSISTENT_EXPOSURE else []) for name in RENDER_EXPOSURES],
-)
+@pytest.mark.parametrize("exposure", RENDER_EXPOSURES)
 def test_the_address_chooses_the_exposure(browser: Browser, tmp_path: Path, exposure: str):
     model = random_model_with_map(300)
     open_complete_page(browser, tmp_path, make_model_page(model), f"?exposure={exposure}")

@@ -29,6 +29,7 @@ from hyrfpack.web.html import decode_splats_page
 
 
 @pytest.mark.smoke
+@pytest.mark.in_turn
 def test_pictures_equal_those_of_our_rasterizer(browser: Browser, tmp_path: Path):
     splats = random_splats()
     page = make_splats_page(splats, sky_panorama())

@@ -618,7 +618,6 @@ def test_every_button_has_a_working_key(browser: Browser, tmp_path: Path):
     wait_until(browser, "!document.getElementById('help').open")
 
 
-@pytest.mark.smoke
 def test_screen_readers_get_labels_and_status_messages(browser: Browser, tmp_path: Path):
     watch = (
         "addEventListener('DOMContentLoaded', () => { window.heard = [];"

@@ -48,6 +48,7 @@ MODEL_SETTINGS = {
 }
 
 
+@pytest.mark.in_turn
 @pytest.mark.parametrize(
     "case",
     [pytest.param("usual", marks=pytest.mark.smoke), *(name for name in MODEL_SETTINGS if name != "usual")],

@@ -73,7 +73,6 @@ def test_the_page_reports_that_it_waits_for_the_first_step(browser: Browser):
         assert browser.evaluate(REMARK_TEXT_JS) == "" and browser.list_errors() == []
 
 
-@pytest.mark.smoke
 def test_a_newer_snapshot_replaces_the_previous_one_and_keeps_the_camera(browser: Browser):
     browser.prefer(less_motion=True)
     with open_training_page(browser, (encode_snapshot(20), 1)) as (training, _):

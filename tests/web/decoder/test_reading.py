@@ -127,6 +127,7 @@ def test_every_group_in_every_codec_decodes_to_the_same_numbers():
     assert accepted == list(files)
 
 
+@pytest.mark.acceptance
 def test_streams_of_many_lanes_decode_to_the_same_numbers():
     """The file has dozens of lanes, static and adaptive models, and a layer of which every second point is counted."""
     data = encode(random_model(3, 160_000), "compact", prune=False)
@@ -454,6 +455,7 @@ def file_with_opacity_stream(stream: bytes, classes: np.ndarray, steps: bytes = 
     return build_file(meta, zero_payloads(meta) | {"POSI": (6, points), "OPAC": (7, payload)})
 
 
+@pytest.mark.acceptance
 def test_too_many_and_too_long_lanes_are_refused():
     few, many = np.array([0, 1, 2, 1, 0], np.uint8), np.zeros(65537, np.uint8)
     many[7] = 1

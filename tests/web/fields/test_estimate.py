@@ -61,6 +61,7 @@ def test_all_values_of_a_model_with_few_gaussians_are_exact(tmp_path: Path, sett
         np.testing.assert_allclose(estimate, exact, **ROUNDING_TOLERANCES)
 
 
+@pytest.mark.acceptance
 def test_anchors_have_exact_values_and_others_the_neural_values_of_a_near_anchor(tmp_path: Path):
     model = make_model(MAX_ANCHORS + 900)
     estimate, exact = estimate_in_node(model, tmp_path), evaluate_in_float64(model)

@@ -144,6 +144,7 @@ def invalid_provenances() -> list[Any]:
     return made
 
 
+@pytest.mark.acceptance
 def test_an_invalid_provenance_still_gives_a_valid_viewpoint(tmp_path: Path) -> None:
     cases = [make_metadata(provenance) for provenance in invalid_provenances()]
     frames = [{"center": [1e308, 0, 0]}, {"scale": 1e308}, {"scale": 5e-324}, {"center": [1e37, 1e37, -1e37]}]

@@ -137,6 +137,7 @@ def test_the_camera_of_three_is_the_first_camera_of_the_file(app_folder: Path, t
     assert found["sphere"] is None
 
 
+@pytest.mark.acceptance
 def test_a_background_becomes_a_sphere_with_the_same_colors(app_folder: Path, tmp_path: Path) -> None:
     model = make_model(5, background=True)
     found = describe_in_node(app_folder, save_model(model, tmp_path / "scene.hyrf"), 0)
