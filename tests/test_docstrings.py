@@ -46,9 +46,9 @@ def list_public_functions() -> Iterator[tuple[str, object]]:
 PUBLIC_FUNCTIONS = dict(list_public_functions())
 # Tests of their packages call these in the integration layer, on less than the examples need.
 SLOW_EXAMPLES = {
-    "hyrfpack.benchmark_model", "hyrfpack.compress_model", "hyrfpack.edit_model", "hyrfpack.estimate_poses",
-    "hyrfpack.import_splats", "hyrfpack.select_levels", "hyrfpack.split_model", "hyrfpack.train_blocks",
-    "hyrfpack.train_model",
+    "hyrfpack.benchmark_model", "hyrfpack.compare_runs", "hyrfpack.compress_model", "hyrfpack.edit_model",
+    "hyrfpack.estimate_poses", "hyrfpack.import_splats", "hyrfpack.select_levels", "hyrfpack.split_model",
+    "hyrfpack.train_blocks", "hyrfpack.train_model",
 }  # fmt: skip
 
 

@@ -60,6 +60,7 @@ def rms(values) -> float:
     return float(np.sqrt(np.mean(np.square(np.asarray(values, np.float64)))))
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize("measure", [rasterize_rows, hash_encode_rows, mlp_rows, render_rows])
 def test_every_setting_has_one_reference_without_error_and_one_default(measure):
     for values in rows_by_setting(measure(make_subject(make_model()), 1, [])).values():

@@ -128,7 +128,7 @@ SINGLE_FILE_COMMANDS = [
 ]
 # These write with the same function as another command of the list. The acceptance layer has all commands in all tests.
 SLOW_COMMANDS = ("compress first", "export model.hyrf --baked")
-# Of the three tests below, the integration layer has the first for these.
+# The integration layer has at least one of the three tests below for most of these.
 SLOWER_COMMANDS = (*SLOW_COMMANDS, "export model.hyrf --sh-degree 0", "import ", "compare ", "make packed.hyrf")
 
 
@@ -147,7 +147,7 @@ FOLDER_COMMANDS_WITH_FREE_NAMES = [
 @pytest.mark.usefixtures("quick_import")
 @pytest.mark.parametrize(
     ("command", "asked", "beside"),
-    mark_slow([*SINGLE_FILE_COMMANDS, *FOLDER_COMMANDS_WITH_FREE_NAMES], SLOW_COMMANDS),
+    mark_slow([*SINGLE_FILE_COMMANDS, *FOLDER_COMMANDS_WITH_FREE_NAMES], (*SLOW_COMMANDS, "import ", "compare ")),
 )
 def test_a_file_that_appears_meanwhile_is_kept_and_the_result_gets_another_name(
     command, asked, beside, working_folder, monkeypatch

@@ -107,6 +107,7 @@ def test_invalid_inputs_of_import_are_a_clear_error(source: Path, tmp_path: Path
     assert not target.exists()
 
 
+@pytest.mark.acceptance
 def test_import_reports_a_missed_target(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pack, "MAX_TRIALS", 1)
     monkeypatch.setattr(pack, "PLANNED_ERROR_SHARE", 16.0)  # makes the only file miss the target

@@ -178,6 +178,7 @@ def test_convert_describes_input_and_output(files, tmp_path):
     assert "stores harmonics up to degree 0" in result.stderr
 
 
+@pytest.mark.acceptance
 def test_convert_prints_json_and_replaces_only_with_overwrite(files, tmp_path):
     target = tmp_path / "a.spz"
     options = ("--sh-degree", 0, "--crop", "-9,-9,-9,9,9,0", "--min-opacity", 0.5, "--json")

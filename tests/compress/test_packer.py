@@ -187,6 +187,7 @@ def test_sizes_after_packing_and_export_match_the_recorded_ones(
     assert sizes == pytest.approx(json.loads(RECORDED_SIZES_FILE.read_text()), rel=0.01)
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("few_views")
 def test_results_do_not_depend_on_the_number_of_threads(ball_file, tmp_path, monkeypatch):
     packed = set()
@@ -328,6 +329,7 @@ def test_the_distortion_is_lowered_until_the_drop_on_training_photos_is_met(
     assert trial.data == trial.measured_error == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("few_views")
 def test_a_file_that_grows_is_reported(ball_file, tmp_path, caplog):
     coarse, fine = tmp_path / "coarse.hyrf", tmp_path / "fine.hyrf"
@@ -392,6 +394,7 @@ def test_provenance_is_kept_with_a_sample_of_cameras(compact_file_and_report, pa
     assert 0 < len(after["coarse_cameras"]) <= MIN_COARSE_CAMERAS and "cameras" in before and "cameras" not in after
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("few_views")
 def test_a_compressed_file_can_be_recompressed_and_unpacked_exactly(paper_file, scene, tmp_path):
     from_paper = compress_model(paper_file, tmp_path / "small.hyrf", data=scene)
@@ -451,6 +454,7 @@ def test_progress_grows_and_the_work_ends_when_it_is_stopped(ball_file, tmp_path
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.acceptance
 @pytest.mark.usefixtures("few_views")
 def test_an_unreachable_max_psnr_drop_is_refused(ball_file, tmp_path, monkeypatch):
     scored = limits.evaluate_model

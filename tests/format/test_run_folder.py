@@ -104,6 +104,7 @@ def test_every_function_reports_an_unfinished_run(call, unfinished_folder, tmp_p
     assert [path.name for path in tmp_path.iterdir()] == ["early"]
 
 
+@pytest.mark.acceptance
 def test_reading_a_run_equals_reading_its_model(run_folder, tmp_path):
     assert len(hyrfpack.load_model(run_folder)) == len(GAUSSIAN_POSITIONS)
     assert hyrfpack.describe_file(run_folder) == hyrfpack.describe_file(run_folder / "model.hyrf")

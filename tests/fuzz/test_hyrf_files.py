@@ -159,6 +159,7 @@ def test_too_many_gaussians_for_the_length_of_the_file_are_refused_before_any_al
     assert peak < 1 << 20
 
 
+@pytest.mark.acceptance
 def test_a_model_that_readers_would_refuse_is_not_written():
     model = small_model(np.zeros((EXTRA_GAUSSIANS_PER_FILE + 200_000, 3)))
 

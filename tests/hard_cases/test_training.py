@@ -198,12 +198,14 @@ BAD_STARTS = {
 SLOW_STARTS = {  # the integration layer has a similar start for each of these
     "all points a million units away",
     "no points",
+    "one point",
     "one black picture",
     "one-pixel cut-outs and no points",
     "one-pixel pictures and no points",
     "ten points",
     "views from one place and no points",
     "views from one place the same way",
+    "views the same way",
     "views the same way and no points",
 }
 

@@ -40,12 +40,14 @@ def test_the_report_describes_the_file(tmp_path: Path) -> None:
     assert hyrfpack.describe_file(target)["profile"] == "compact"
 
 
+@pytest.mark.acceptance
 def test_same_splats_and_seed_give_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.hyrf", "b.hyrf"):
         import_loaded_splats(ball_splats(60), tmp_path / name, TINY_IMPORT_CONFIG)
     assert (tmp_path / "a.hyrf").read_bytes() == (tmp_path / "b.hyrf").read_bytes()
 
 
+@pytest.mark.acceptance
 def test_a_gallery_shows_the_psnr_of_an_import_only_if_the_import_aimed_at_one(tmp_path: Path) -> None:
     reports = {}
     for name, change in (("psnr", {"psnr": 20}), ("size", {"target_bytes": 20_000})):

@@ -56,9 +56,7 @@ class Clock:
         return self.now
 
 
-@pytest.mark.parametrize(
-    ("exposure", "background"), [(False, True), pytest.param(True, False, marks=pytest.mark.acceptance)]
-)
+@pytest.mark.parametrize(("exposure", "background"), [(False, True), (True, False)])
 def test_training_with_a_live_view_gives_the_same_model_bit_by_bit(exposure, background, tmp_path):
     config = dataclasses.replace(TRAIN_CONFIG, steps=20, exposure=exposure, background=background)
     plain = train_model(make_scene(), tmp_path / "plain", config, context=QUIET_CONTEXT)

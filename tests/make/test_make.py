@@ -566,6 +566,7 @@ def test_training_on_photos_without_poses_names_the_command_that_estimates_them(
     assert "'hyrfpack poses" in refused("train", tmp_path / "clip.mp4", "-o", tmp_path / "run")
 
 
+@pytest.mark.acceptance
 def test_training_estimates_poses_once_with_the_option(photos, poses, tmp_path):
     arguments = ("train", photos, "-o", tmp_path / "run", "--poses", "--steps", 3, "--max-gaussians", 50)
     succeeded(*arguments)

@@ -92,6 +92,7 @@ def test_truncated_photos_are_a_clear_error(tmp_path):
     assert ".poses" not in sentence
 
 
+@pytest.mark.acceptance
 def test_photos_without_features_are_a_clear_error(tmp_path):
     rng = np.random.default_rng(0)
     level = [np.full((120, 160, 3), 100, np.uint8) + rng.integers(0, 2, (120, 160, 3), np.uint8) for _ in range(5)]

@@ -120,6 +120,7 @@ def test_blurred_and_repeated_frames_are_never_chosen(wall, tmp_path):
     assert json.loads((tmp_path / "frames" / RECORD_NAME).read_text())["frames"] == numbers
 
 
+@pytest.mark.acceptance
 def test_frames_are_spread_by_motion_and_not_by_time(wall, tmp_path):
     """The camera moves twice as fast in the second half; both parts of the path give the same number of frames."""
     places = np.concatenate((np.arange(0, 300, 2.0), np.arange(300, 900, 6.0)))

@@ -49,6 +49,7 @@ def recorded_threads(monkeypatch) -> dict[str, set[int | None]]:
     return found
 
 
+@pytest.mark.acceptance
 def test_the_number_of_threads_is_that_of_the_environment(recorded_threads, tmp_path: Path):
     names = list(write_photos(tmp_path / "images", 3))
     photos, _ = prepare.read_headers(tmp_path / "images", list_photos(tmp_path / "images"), in_place=False)

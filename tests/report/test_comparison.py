@@ -120,6 +120,7 @@ def test_the_page_shows_all_results_and_only_settings_that_differ(runs, tmp_path
     assert report.bytes == (tmp_path / "page.html").stat().st_size
 
 
+@pytest.mark.acceptance
 def test_the_best_score_is_marked_where_scores_can_be_compared(runs, tmp_path):
     def best(page: Page) -> list[str]:
         return [name for name, attributes in page.tags if attributes.get("class") == "best"]
@@ -166,6 +167,7 @@ def test_only_views_with_pictures_in_all_runs_are_shown(runs, tmp_path):
     assert 'id="views"' not in (tmp_path / "bare.html").read_text()
 
 
+@pytest.mark.acceptance
 def test_a_curve_has_seconds_and_one_of_an_earlier_version_a_note_about_their_absence(runs, tmp_path):
     first = read_metrics(runs[0])["curve"]
     assert [record.seconds for record in read_run(runs[0]).curve] == [record["seconds"] for record in first]

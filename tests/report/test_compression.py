@@ -178,6 +178,7 @@ def test_an_unwritable_folder_is_refused_before_the_work(model_file, tmp_path):
         write_compression_report(tmp_path / "file" / "page", model_file, model_file, report)
 
 
+@pytest.mark.acceptance
 def test_the_page_is_written_after_its_pictures(model_file, tmp_path, monkeypatch):
     def full(path, image, **options):
         raise HyrfError("the disk is full", fix="free some space")
@@ -276,6 +277,7 @@ def test_views_are_sorted_by_descending_loss(report_with_photos, model_file, sce
 # -- other inputs ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.acceptance
 def test_without_photos_renders_are_compared_with_those_of_the_uncompressed_model(model_file, tmp_path):
     _, _, page = compress_and_report(model_file, tmp_path, distortion=1e-4)
     assert "dB between pictures before and after" in page.texts["h1"][0]

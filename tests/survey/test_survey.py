@@ -256,6 +256,7 @@ def test_info_prints_the_survey_as_text_and_as_json(photos):
     assert "what to do\n  - the photos have no poses" in printed
 
 
+@pytest.mark.acceptance
 def test_info_of_a_video_says_how_many_frames_would_be_taken(tmp_path):
     av = pytest.importorskip("av")
     wall = random_rectangles(3, 700, 120)
