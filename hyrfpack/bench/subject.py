@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.capture import Capture, place_photos
 from hyrfpack.cameras.paths import orbit
 from hyrfpack.compress.distortion import default_distortion
 from hyrfpack.context import RunContext
@@ -120,6 +120,7 @@ def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
             f"{path}: the model has no Gaussians, so there is nothing to measure",
             fix="choose another model",
         )
+    scene = place_photos(facts, scene)
     capture = Capture(facts, scene)
     if scene is None:
         cameras, photos = orbit(capture.viewpoint, MAX_VIEWS), None

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
 from hyrfpack.cameras.files import camera_from_numbers, camera_to_numbers
 from hyrfpack.cameras.paths import Viewpoint, orbit
+from hyrfpack.cameras.placement import Placement
 from hyrfpack.cameras.sampling import (
     COARSE_RATE_RATIO,
     MAX_RATE_RATIO,
@@ -35,9 +36,11 @@ PSNR_BEFORE_KEY = "psnr_before"
 PSNR_BEFORE_COMPRESSION = "compression"
 PSNR_BEFORE_EDIT = "an edit"
 
-MISMATCH_REMEDY = (
-    "name the photos and poses that it was trained on; if an edit moved the model, use it as it was before the move"
-)
+# The key of a provenance that says where edits have moved the model: a `Placement` that maps world coordinates of its
+# photos' poses to those of the model.
+PLACEMENT_KEY = "placement"
+
+MISMATCH_REMEDY = "name the photos and poses that it was trained on"
 # A stored camera matches a photo's camera that differs from it by no more than these two limits.
 _MAX_MATCH_DISTANCE_SCENE_SCALES = 5 / COARSE_POSE_STEPS_PER_SCENE_SCALE
 _MAX_MATCH_ANGLE_DEGREES = 3.0
@@ -200,32 +203,47 @@ class Capture:
         """
         if self.scene is None:
             return ""
-        views = self.scene.views
+        differences = self._differences_of_stored_cameras()
+        found = int((differences <= 1).sum())
+        if found >= _MIN_MATCHED_CAMERA_SHARE * len(differences):
+            return ""
+        return (
+            f"{self.scene.path}: of the {len(differences)} cameras that the model keeps of its training, "
+            f"{found or 'none'} "
+            f"{'are' if found > 1 else 'is'} among those of these photos, which may show another scene or have poses "
+            "in another coordinate frame"
+        )
+
+    @property
+    def difference(self) -> float:
+        """How much the scene's cameras differ from those stored in the file: their median difference.
+
+        1 is the largest difference at which a stored camera matches. Without cameras to compare it is 0.
+        """
+        differences = self._differences_of_stored_cameras()
+        return float(np.median(differences)) if len(differences) else 0.0
+
+    def _differences_of_stored_cameras(self) -> np.ndarray:
+        """Return how much each stored camera (K,) differs from the most similar one of the scene.
+
+        1 is the largest difference in position or direction at which cameras match. K is 0 if none can be compared.
+        """
+        views = [] if self.scene is None else self.scene.views
         try:
             kept = [camera_from_numbers(numbers) for numbers in self._stored_cameras or self._coarse_cameras or ()]
             limit = _MAX_MATCH_DISTANCE_SCENE_SCALES * float(self.facts["config"]["frame"]["scale"])
         except (TypeError, ValueError, ArithmeticError, KeyError):
-            return ""
+            return np.zeros(0)
         if not (views and kept):
-            return ""
+            return np.zeros(0)
         positions = np.array([view.camera.position for view in views])
         directions = np.array([view.camera.forward for view in views])
-        min_cosine = np.cos(np.radians(_MAX_MATCH_ANGLE_DEGREES))
-        found = sum(
-            bool(
-                np.any(
-                    (np.linalg.norm(positions - c.position, axis=1) <= limit) & (directions @ c.forward >= min_cosine)
-                )
-            )
-            for c in kept
-        )
-        if found >= _MIN_MATCHED_CAMERA_SHARE * len(kept):
-            return ""
-        return (
-            f"{self.scene.path}: of the {len(kept)} cameras that the model keeps of its training, {found or 'none'} "
-            f"{'are' if found > 1 else 'is'} among those of these photos, which may show another scene or have poses "
-            "in another coordinate frame"
-        )
+        differences = []
+        for camera in kept:
+            distances = np.linalg.norm(positions - camera.position, axis=1) / limit
+            angles = np.degrees(np.arccos(np.clip(directions @ camera.forward, -1, 1))) / _MAX_MATCH_ANGLE_DEGREES
+            differences.append(np.maximum(distances, angles).min())
+        return np.array(differences)
 
     @property
     def max_size(self) -> int:
@@ -248,3 +266,27 @@ class Capture:
     @property
     def _training_cameras(self) -> list[Camera]:
         return [] if self.scene is None else [view.camera for view in self.scene.train]
+
+
+@overload
+def place_photos(facts: dict, scene: Scene) -> Scene: ...
+@overload
+def place_photos(facts: dict, scene: None) -> None: ...
+def place_photos(facts: dict, scene: Scene | None) -> Scene | None:
+    """Return photos in the coordinates of a model.
+
+    Edits may have moved the model since it was trained on the photos. Then the photos are moved in the same way, unless
+    their cameras already agree better with those that the model keeps.
+
+    Args:
+        facts: the result of `hyrfpack.describe_file`.
+        scene: photos with the poses of training, or with poses in the coordinates of the model; or None.
+    """
+    if scene is None:
+        return None
+    try:
+        moved = Placement.from_json(facts["provenance"][PLACEMENT_KEY]).move_scene(scene)
+    except (TypeError, ValueError, ArithmeticError, KeyError):  # never moved, or no valid placement
+        return scene
+    as_given, as_moved = (Capture(facts, candidate).difference for candidate in (scene, moved))
+    return moved if as_moved < as_given else scene

@@ -161,7 +161,7 @@ def read_scene(
 ) -> Scene:
     """Read a folder of photos and poses, and print the reader's notes.
 
-    A further note says whether a model was trained on other photos.
+    The poses are moved as edits have moved the model. A further note says whether it was trained on other photos.
 
     Args:
         path: the folder, or an archive of it.
@@ -173,7 +173,7 @@ def read_scene(
     Raises:
         HyrfError: as `hyrfpack.load_scene`, or the photos do not match the model.
     """
-    from hyrfpack.cameras.capture import MISMATCH_REMEDY, Capture
+    from hyrfpack.cameras.capture import MISMATCH_REMEDY, Capture, place_photos
     from hyrfpack.data import load_scene
     from hyrfpack.scene import DEFAULT_MAX_SIZE
 
@@ -182,7 +182,10 @@ def read_scene(
     scene = load_scene(path, **reader_options)
     for sentence in scene.notes:
         note(sentence)
-    if model is not None and (mismatch := Capture(model, scene).mismatch):
+    if model is None:
+        return scene
+    scene = place_photos(model, scene)
+    if mismatch := Capture(model, scene).mismatch:
         if must_match:
             raise HyrfDataError(mismatch, fix=MISMATCH_REMEDY)
         note(f"{mismatch}; {MISMATCH_REMEDY}")

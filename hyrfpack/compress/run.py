@@ -6,7 +6,7 @@ import logging
 from dataclasses import replace
 from pathlib import Path
 
-from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.capture import Capture, place_photos
 from hyrfpack.checks import check_type
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB, default_distortion
@@ -83,6 +83,7 @@ def compress_model(
     outputs = Outputs(source, scene=data, overwrite=overwrite)
     ranks.run_on_main(lambda: outputs.file(target))
     check_request(config, data)
+    data = place_photos(describe_file(source), data)
     compress = _compress_merged if is_merged(source) else _compress_single
     report = compress(source, target, config, data, overwrite, context)
     if config.profile == "compact" and report.bytes_after > (before := source.stat().st_size):

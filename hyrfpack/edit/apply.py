@@ -12,14 +12,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.cameras.capture import MISMATCH_REMEDY, PSNR_BEFORE_EDIT, PSNR_BEFORE_KEY, Capture, has_mean_exposure
+from hyrfpack.cameras.capture import (
+    MISMATCH_REMEDY,
+    PSNR_BEFORE_EDIT,
+    PSNR_BEFORE_KEY,
+    Capture,
+    has_mean_exposure,
+    place_photos,
+)
 from hyrfpack.cameras.paths import estimate_up
+from hyrfpack.cameras.placement import Placement, unit_vector
 from hyrfpack.config.edit import Action, Background, Center, Crop, EstimateUp, Move, Refit, Remove, Up, Upright
 from hyrfpack.edit.refit import refit, score_region
 from hyrfpack.edit.report import ActionReport
 from hyrfpack.edit.select import keep_mask
 from hyrfpack.edit.state import EditState
-from hyrfpack.edit.transform import Placement, replace_config, unit_vector
+from hyrfpack.edit.transform import move_provenance, placement_of, replace_config
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.format.container import Container
 from hyrfpack.format.metadata import read_metadata
@@ -77,6 +85,7 @@ class Edit:
         before, after: the scene before the first action and after the last one.
         reports: what each action has done.
         parts: the models of the file that have Gaussians after the last action, in order.
+        data: photos of the scene in the coordinates of the file, or None.
     """
 
     path: Path
@@ -85,6 +94,7 @@ class Edit:
     after: EditState
     reports: list[ActionReport]
     parts: list[EditedPart]
+    data: Scene | None
 
     @property
     def profile(self) -> str:
@@ -126,6 +136,7 @@ def open_scene(path: Path, source: Path, data: Scene | None, progress: Progress)
     }
     scene = parts[0]
     capture = captures[scene.name]
+    data = place_photos(capture.facts, data)
     if mismatch := Capture(capture.facts, data).mismatch:
         raise HyrfDataError(mismatch, fix=MISMATCH_REMEDY)
     state = EditState(
@@ -141,7 +152,7 @@ def open_scene(path: Path, source: Path, data: Scene | None, progress: Progress)
         held_out=[] if data is None else list(data.test),
         has_gains=scene.before.exposure is not None or has_mean_exposure(scene.provenance),
     )
-    return Edit(path, source, state, state, [], parts)
+    return Edit(path, source, state, state, [], parts, data)
 
 
 def apply_actions(edit: Edit, actions: Sequence[Action]) -> Edit:
@@ -159,7 +170,7 @@ def apply_actions(edit: Edit, actions: Sequence[Action]) -> Edit:
     parts = []
     for name, after in zip(names, parts_of(state.model), strict=True):
         part, placement = sources[name], state.placement
-        provenance = part.provenance if placement.is_identity else placement.move_provenance(part.provenance)
+        provenance = part.provenance if placement.is_identity else move_provenance(placement, part.provenance)
         edited = replace(part, after=after, provenance=provenance)
         if "psnr" in provenance and not edited.keeps_looks:
             edited = replace(edited, provenance={**provenance, PSNR_BEFORE_KEY: PSNR_BEFORE_EDIT})
@@ -251,7 +262,7 @@ def _refit(action: Refit, state: EditState, report: ActionReport) -> tuple[EditS
 def _find_move(action: Action, state: EditState) -> Placement | None:
     """Return the map of world positions that an action applies, None if it moves nothing."""
     if isinstance(action, Move):
-        return Placement.of(action)
+        return placement_of(action)
     if isinstance(action, Upright):
         return Placement(rotation=upright_rotation(unit_vector(state.up), np.eye(3)["xyz".index(action.axis)]))
     if isinstance(action, Center):

@@ -7,9 +7,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.cameras.placement import Placement
 from hyrfpack.checks import check_several
 from hyrfpack.config.edit import Move
-from hyrfpack.edit.transform import Placement
+from hyrfpack.edit.transform import move_frame, move_provenance, placement_of
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.arrays import read_config
 from hyrfpack.format.container import Container
@@ -157,7 +158,7 @@ def _check_moves(stems: Sequence[str], moves: Mapping[str, Sequence[Move]]) -> d
             )
         placement = Placement()
         for action in actions:
-            placement = placement.then(Placement.of(action))
+            placement = placement.then(placement_of(action))
         placements[name] = placement
     return placements
 
@@ -165,8 +166,8 @@ def _check_moves(stems: Sequence[str], moves: Mapping[str, Sequence[Move]]) -> d
 def _moved_bytes(part: Container, placement: Placement) -> bytes:
     """Return the bytes of a model that is placed elsewhere; only its metadata differ."""
     config = read_config(part)
-    moved = replace(config, frame=placement.move_frame(config.frame))
-    return with_metadata(part, moved, placement.move_provenance(read_provenance(part)))
+    moved = replace(config, frame=move_frame(placement, config.frame))
+    return with_metadata(part, moved, move_provenance(placement, read_provenance(part)))
 
 
 def _free_name(name: str, taken: set[str]) -> str:

@@ -83,12 +83,12 @@ def edit_model(
         outputs.file(picture, *PICTURE_ENDINGS)
     with tempfile.TemporaryDirectory() as folder, context.open_progress("edit") as progress:
         opened = open_scene(take_part(path, part, folder), path, data, part_of_progress(progress, 0, 0.3))
-        check_limits(opened, profile, limits, data)
+        check_limits(opened, profile, limits)
         edit = apply_actions(opened, actions)
         writing = replace(context, device="cpu", progress=part_of_progress(progress, 0.3, 0.8))
-        written = write_edit(edit, target, profile, limits, data, overwrite, writing)
+        written = write_edit(edit, target, profile, limits, overwrite, writing)
         edit = replace(edit, after=replace(edit.after, model=load_model_or_parts(written.file)))
-        report = _measure(edit, data, part_of_progress(progress, 0.8, 1))
+        report = _measure(edit, part_of_progress(progress, 0.8, 1))
         if picture is not None:
             _save_comparison(picture, edit, overwrite)
     found = written.found if isinstance(written, CompressionReport) else ""
@@ -136,7 +136,7 @@ def plan_edit(
     with tempfile.TemporaryDirectory() as folder, context.open_progress("edit") as progress:
         opened = open_scene(take_part(path, part, folder), path, data, part_of_progress(progress, 0, 0.5))
         edit = apply_actions(opened, actions)
-        report = _measure(edit, data, part_of_progress(progress, 0.5, 1))
+        report = _measure(edit, part_of_progress(progress, 0.5, 1))
         if picture is not None:
             _save_comparison(picture, edit, overwrite)
     return report
@@ -166,7 +166,7 @@ def _check_request(
     return find_model(source)
 
 
-def _measure(edit: Edit, data: Scene | None, progress: Progress) -> EditReport:
+def _measure(edit: Edit, progress: Progress) -> EditReport:
     """Compare renders of both scenes, and score both on held-out photos."""
     cameras = evenly_spaced(edit.before.cameras, MAX_COMPARED_VIEWS)
     changes = []
@@ -183,10 +183,11 @@ def _measure(edit: Edit, data: Scene | None, progress: Progress) -> EditReport:
         psnr_change=statistics.fmean(changes),
         psnr_change_worst=min(changes),
     )
-    if data is None or not data.test:
+    views = [] if edit.data is None else edit.data.test
+    if not views:
         return report
-    moved = [edit.after.placement.move_view(view) for view in data.test]
-    before = evaluate_model(edit.before.model, data.test, progress=part_of_progress(progress, 0.3, 0.65))
+    moved = [edit.after.placement.move_view(view) for view in views]
+    before = evaluate_model(edit.before.model, views, progress=part_of_progress(progress, 0.3, 0.65))
     after = evaluate_model(edit.after.model, moved, progress=part_of_progress(progress, 0.65, 1))
     return replace(
         report, psnr_before=before.psnr, psnr_after=after.psnr, ssim_before=before.ssim, ssim_after=after.ssim

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from hyrfpack.cameras.placement import Placement
 from hyrfpack.compress.removals import measure_removals
 from hyrfpack.config.edit import (
     CropBox,
@@ -26,7 +27,6 @@ from hyrfpack.edit.floaters import find_floaters
 from hyrfpack.edit.masks import share_of_light_in_masks
 from hyrfpack.edit.polygon import find_corners, find_inside
 from hyrfpack.edit.state import EditState
-from hyrfpack.edit.transform import Placement
 from hyrfpack.errors import HyrfError
 from hyrfpack.model.merged import MergedModel, parts_of, scene_of
 

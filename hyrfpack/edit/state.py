@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from hyrfpack.cameras.capture import Capture
-from hyrfpack.edit.transform import Placement
+from hyrfpack.cameras.placement import Placement
+from hyrfpack.edit.transform import move_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel, map_parts, world_positions
@@ -78,7 +80,7 @@ class EditState:
         """Return the scene in new world coordinates."""
         return replace(
             self,
-            model=map_parts(step.move_model, self.model),
+            model=map_parts(partial(move_model, step), self.model),
             cameras=[step.move_camera(camera) for camera in self.cameras],
             center=step.move_point(self.center),
             up=step.move_direction(self.up),

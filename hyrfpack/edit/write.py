@@ -30,20 +30,19 @@ from hyrfpack.progress import part_of_progress
 from hyrfpack.scene import Scene, View
 
 
-def check_limits(edit: Edit, profile: str | None, limits: EditLimits, data: Scene | None) -> None:
+def check_limits(edit: Edit, profile: str | None, limits: EditLimits) -> None:
     """Check that the profile and the limits of the file to write suit the scene before its actions.
 
     Args:
         edit: the opened scene.
         profile: the profile; None for that of the source, or "compact" with limits.
         limits: largest size or largest loss of the file.
-        data: photos of the scene, or None.
 
     Raises:
         HyrfError: the limits exclude each other or the profile, need photos, or no file can be that small.
     """
     for part in edit.parts:
-        check_request(_choose_settings(part, profile, limits), None if limits == EditLimits() else data)
+        check_request(_choose_settings(part, profile, limits), None if limits == EditLimits() else edit.data)
     if limits.target_bytes is not None:
         for part in edit.parts:
             check_target_bytes(
@@ -56,7 +55,6 @@ def write_edit(
     target: StrPath,
     profile: str | None,
     limits: EditLimits,
-    data: Scene | None,
     overwrite: bool,
     context: RunContext,
 ) -> FileReport:
@@ -81,7 +79,7 @@ def write_edit(
                 share = part_of_progress(progress, number / len(copies), (number + 1) / len(copies))
                 encoded.append(done or _encode_part(edit, part, config, replace(context, progress=share)))
         return _write(_join(edit, encoded), target, overwrite)
-    photos = None if data is None or limits.max_psnr_drop is None else _unchanged_photos(edit, data)
+    photos = None if edit.data is None or limits.max_psnr_drop is None else _unchanged_photos(edit, edit.data)
     with tempfile.TemporaryDirectory() as folder:
         edited = Path(folder, "edited.hyrf")
         write_atomic(edited, _join(edit, [encode_model(part.after, "raw", part.provenance) for part in edit.parts]))

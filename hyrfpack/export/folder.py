@@ -14,7 +14,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from hyrfpack.cameras.capture import PSNR_BEFORE_COMPRESSION, PSNR_BEFORE_EDIT, PSNR_BEFORE_KEY
+from hyrfpack.cameras.capture import PSNR_BEFORE_COMPRESSION, PSNR_BEFORE_EDIT, PSNR_BEFORE_KEY, place_photos
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.checks import check_several, check_type
 from hyrfpack.counts import format_count
@@ -317,6 +317,7 @@ class _PlayableContent:
             poster = render_splats_poster(splats, frame, viewpoint.camera, POSTER_LONGEST_SIDE_PIXELS)
             stage = encode_stage([viewpoint.camera], viewpoint.up, viewpoint.center)
             return cls(len(splats), length, poster, stage=stage)
+        data = place_photos(describe_file(path), data)
         loaded = Source.read(path, data)
         quality = _describe_quality(path, loaded.drawn, data) if with_quality else ""
         cameras = page_cameras(loaded)

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.cameras.capture import place_photos
 from hyrfpack.checks import check_type
 from hyrfpack.config.export import ExportConfig
 from hyrfpack.context import RunContext
@@ -42,7 +43,7 @@ from hyrfpack.export.scores import measure_export
 from hyrfpack.export.source import Source
 from hyrfpack.export.streamed_sog import write_streamed_sog
 from hyrfpack.export.tiles import write_tiles
-from hyrfpack.format import find_model
+from hyrfpack.format import describe_file, find_model
 from hyrfpack.format.input_folder import find_input_folder
 from hyrfpack.format.scene_folder import SceneFolder, single_file
 from hyrfpack.lock import exclusive_folder
@@ -156,6 +157,7 @@ def _export_file(
         check_place(target, Outputs(model, folder=folder, scene=data, overwrite=True), config)
     with exclusive_folder(target) if is_folder else nullcontext():
         check_place(target, Outputs(model, folder=folder, scene=data, overwrite=overwrite), config)
+        data = place_photos(describe_file(source), data)
         loaded = Source.read(source, data)
         if kind is HTML_PAGE and not config.baked:
             return write_native_page(loaded, source, target, config, overwrite)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hyrfpack.cameras.capture import MIN_COARSE_CAMERAS, Capture
+from hyrfpack.cameras.capture import MIN_COARSE_CAMERAS, Capture, place_photos
 from hyrfpack.cameras.files import camera_to_numbers
 from hyrfpack.cameras.view_sampling import resize_camera, sample_views
 from hyrfpack.checks import check_type, remove_control_characters
@@ -144,6 +144,7 @@ def split_model(
     Outputs(path, scene=data, overwrite=True).folder(target, [MANIFEST_NAME, *shared_names])
     with exclusive_folder(target), context.open_progress("split") as progress:
         Outputs(path, scene=data, overwrite=overwrite).folder(target, [MANIFEST_NAME, *shared_names])
+        data = place_photos(describe_file(path), data)
         files, manifest = _split(path, shared_names, name_model(source), config, data, progress)
         Outputs(path, scene=data, overwrite=overwrite).folder(target, files)
         _check_manifest(manifest, target / MANIFEST_NAME)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from hyrfpack.atomic import write_atomic
-from hyrfpack.cameras.capture import Capture
+from hyrfpack.cameras.capture import Capture, place_photos
 from hyrfpack.compress import CompressionReport
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import DISTORTION_RANGE, default_distortion
@@ -120,6 +120,7 @@ def _write_report(
 ) -> Path:
     """Do the work of `write_compression_report` in a folder that this call has locked."""
     model, provenance = load_with_provenance(source)
+    scene = place_photos(describe_file(source), scene)
     views, views_in_words = _views_to_score(model, source, scene)
     _LOG.info(f"comparing renders with {views_in_words} for the report")
     before = evaluate_model(model, views)

@@ -16,6 +16,7 @@ from scenes import QUIET_CONTEXT, ring, shift_cameras
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.cameras.capture import Capture, provenance_cameras
+from hyrfpack.cameras.placement import Placement
 from hyrfpack.compress import compress_model
 from hyrfpack.config.edit import (
     Background,
@@ -36,7 +37,7 @@ from hyrfpack.config.edit import (
 )
 from hyrfpack.config.export import ExportConfig
 from hyrfpack.edit import edit_model, plan_edit
-from hyrfpack.edit.transform import Placement
+from hyrfpack.edit.transform import move_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
 from hyrfpack.export import export_model
@@ -145,7 +146,9 @@ def test_a_rotation_about_an_axis_is_right_handed(axis, degrees):
 def test_two_turns_of_a_model_are_one_turn_by_their_product():
     first, second = (Rotation.from_rotvec(turn) for turn in ([0.3, 1.1, -0.7], [-1.9, 0.2, 0.4]))
     model = load_model(COMPACT_FILE)
-    in_turn = Placement(rotation=second.as_matrix()).move_model(Placement(rotation=first.as_matrix()).move_model(model))
+    in_turn = move_model(
+        Placement(rotation=second.as_matrix()), move_model(Placement(rotation=first.as_matrix()), model)
+    )
     w, *vector = in_turn.config.frame.rotation
     assert_allclose(Rotation.from_quat([*vector, w]).as_matrix(), (second * first).as_matrix(), atol=1e-13)
     assert_allclose(in_turn.config.frame.center, (second * first).apply(model.config.frame.center), atol=1e-12)
@@ -156,7 +159,7 @@ def test_a_full_turn_in_steps_gives_the_start_back(steps):
     start = load_model(COMPACT_FILE)
     model, step = start, Placement.rotation_about_axis((0.3, -1.2, 0.5), 360 / steps)
     for _ in range(steps):
-        model = step.move_model(model)
+        model = move_model(step, model)
     assert not model.config.frame.is_rotated  # and so the file has no rotation
     assert_allclose(model.config.frame.center, start.config.frame.center, atol=1e-12)
 

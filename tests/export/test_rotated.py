@@ -19,7 +19,8 @@ import hyrfpack
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.files import cameras_from_json
 from hyrfpack.cameras.paths import Viewpoint
-from hyrfpack.edit.transform import Placement, replace_config
+from hyrfpack.cameras.placement import Placement
+from hyrfpack.edit.transform import move_model, move_provenance, replace_config
 from hyrfpack.export.background import background_picture, background_splats
 from hyrfpack.export.bake import bake
 from hyrfpack.format import save_model
@@ -54,7 +55,7 @@ def write_both(folder: Path, model) -> tuple[Path, Path]:
     kept = {"cameras": provenance_cameras(CAMERAS), "viewpoint": Viewpoint.from_cameras(CAMERAS).to_json()}
     before, after = folder / "before.hyrf", folder / "after.hyrf"
     save_model(model, before, provenance=kept)
-    save_model(STEP.move_model(model), after, provenance=STEP.move_provenance(kept))
+    save_model(move_model(STEP, model), after, provenance=move_provenance(STEP, kept))
     return before, after
 
 
@@ -96,7 +97,7 @@ def test_a_bake_turns_shapes_and_harmonics_with_the_model(degree):
     model = model_of_balls()
 
     before = bake(model, CAMERAS, (degree,))[degree]
-    after = bake(STEP.move_model(model), [STEP.move_camera(camera) for camera in CAMERAS], (degree,))[degree]
+    after = bake(move_model(STEP, model), [STEP.move_camera(camera) for camera in CAMERAS], (degree,))[degree]
 
     assert degree == 0 or np.ptp(colors_along(before, np.eye(3)), axis=1).max() > 0.05  # colours depend on the view
     assert_moved(before, after)
@@ -107,7 +108,7 @@ def test_a_bake_applies_the_exposure_map_in_the_axes_of_the_frame():
     model.exposure = map_with_gains(CAMERAS, model.config.frame, np.linspace(0.7, 1.4, 24).reshape(8, 3))
 
     before = bake(model, CAMERAS)[3]
-    after = bake(STEP.move_model(model), [STEP.move_camera(camera) for camera in CAMERAS])[3]
+    after = bake(move_model(STEP, model), [STEP.move_camera(camera) for camera in CAMERAS])[3]
 
     assert_moved(before, after)
 
@@ -129,7 +130,7 @@ def test_background_splats_turn_with_the_model():
     model = model_of_balls()
 
     before = background_splats(model, CAMERAS)
-    after = background_splats(STEP.move_model(model), [STEP.move_camera(camera) for camera in CAMERAS])
+    after = background_splats(move_model(STEP, model), [STEP.move_camera(camera) for camera in CAMERAS])
 
     assert_moved(before, after, (1e-3, 1e-5, 1e-3))
 
@@ -137,7 +138,7 @@ def test_background_splats_turn_with_the_model():
 def test_the_background_picture_has_the_axes_of_the_world():
     """After a quarter turn about y from z to x, the picture is moved by a quarter of its width, from z to x."""
     model = model_of_balls()
-    turned = Placement.rotation_about_axis((0, 1, 0), 90).move_model(model)
+    turned = move_model(Placement.rotation_about_axis((0, 1, 0), 90), model)
 
     before, after = background_picture(model, 32), background_picture(turned, 32)
 
@@ -147,7 +148,7 @@ def test_the_background_picture_has_the_axes_of_the_world():
 
 def test_a_half_turn_about_x_turns_the_background_picture_upside_down():
     model = model_of_balls()
-    turned = Placement.rotation_about_axis((1, 0, 0), 180).move_model(model)
+    turned = move_model(Placement.rotation_about_axis((1, 0, 0), 180), model)
 
     # (x, y, z) becomes (x, -y, -z): latitudes change their signs, and a longitude a becomes pi - a.
     expected = np.roll(background_picture(model, 32)[::-1, ::-1], 32, axis=1)
@@ -185,7 +186,7 @@ def test_the_mesh_of_a_rotated_model_lies_on_the_rotated_surface(tmp_path):
     model = small_model(0.5 * points[points[:, 0] < 0.8], scale_logits=-4.0, opacity_logits=6.0)
     cameras = [camera for height in (-2, 0, 2) for camera in ring(8, elevation=height, width=64, height=64)]
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    save_model(STEP.move_model(model), tmp_path / "shell.hyrf", provenance=STEP.move_provenance(kept))
+    save_model(move_model(STEP, model), tmp_path / "shell.hyrf", provenance=move_provenance(STEP, kept))
 
     hyrfpack.export_model(tmp_path / "shell.hyrf", tmp_path / "shell.obj", hyrfpack.ExportConfig(voxel=0.06))
 
@@ -203,14 +204,14 @@ def test_a_page_of_a_rotated_model_keeps_cameras_and_up_in_world_axes(files, tmp
         scenes.append(json.loads(page.split('<script type="text/plain" id="scene">')[1].split("</script>")[0]))
     before, after = scenes
     assert "rotation" not in before
-    np.testing.assert_allclose(after["rotation"], STEP.move_model(model_of_balls()).config.frame.rotation)
+    np.testing.assert_allclose(after["rotation"], move_model(STEP, model_of_balls()).config.frame.rotation)
     np.testing.assert_allclose(after["up"], TURN @ before["up"], rtol=0, atol=1e-8)
 
 
 def test_a_rotated_model_without_a_viewpoint_is_seen_from_the_rotated_place():
     before, after = (
         Viewpoint.from_frame(frame.center, frame.scale, frame.rotation)
-        for frame in (model.config.frame for model in (model_of_balls(), STEP.move_model(model_of_balls())))
+        for frame in (model.config.frame for model in (model_of_balls(), move_model(STEP, model_of_balls())))
     )
     np.testing.assert_allclose(after.up, TURN @ before.up, rtol=0, atol=1e-12)
     np.testing.assert_allclose(
@@ -220,7 +221,7 @@ def test_a_rotated_model_without_a_viewpoint_is_seen_from_the_rotated_place():
 
 def test_pictures_are_those_of_the_moved_camera_in_double_precision():
     model = model_of_balls().double()
-    moved = STEP.move_model(model)
+    moved = move_model(STEP, model)
     unrotated = replace_config(moved, frame=replace(moved.config.frame, rotation=IDENTITY))
     for position in np.random.default_rng(2).normal(size=(2, 3)):
         camera = camera_at(3 * position / np.linalg.norm(position))

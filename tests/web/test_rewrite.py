@@ -8,13 +8,19 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from web.scripts import run_script
 
+from hyrfpack.cameras.placement import Placement
 from hyrfpack.cli.edit import edit
-from hyrfpack.format.container import Container, Section
+from hyrfpack.edit.transform import move_provenance
+from hyrfpack.format.arrays import read_config
+from hyrfpack.format.container import Container, Section, read_container
 from hyrfpack.format.metadata import read_metadata, writer_name
-from hyrfpack.format.sections import EXPOSURE, METADATA, POSITIONS, SHAPES, layer_section
+from hyrfpack.format.rewrite import with_metadata
+from hyrfpack.format.sections import EXPOSURE, METADATA, POSITIONS, SECTION_CONTENTS, SHAPES, layer_section
+from hyrfpack.format.shared import read_provenance
 from hyrfpack.format.versions import lowest_minor_version
 
 GOLDEN_FOLDER = Path(__file__).parents[1] / "golden"
@@ -41,6 +47,7 @@ EDITS = {
         {"option": "upright", "value": "z"},
         {"option": "scale", "value": 0.5},
     ],
+    "moved before": [UP, {"option": "upright", "value": "y"}, {"option": "scale", "value": 0.5}],
     "cleaned": [{"option": "min-opacity", "value": 0.5}],
     "turned and cleaned": [UP, {"option": "upright", "value": "y"}, {"option": "min-opacity", "value": 0.6}],
 }
@@ -62,6 +69,19 @@ def assert_equal_numbers(first: Any, second: Any, path: str = "") -> None:
         assert first == second, path
 
 
+def read_golden_file(name: str) -> bytes:
+    return (GOLDEN_FOLDER / name).read_bytes()
+
+
+def moved_file(name: str) -> bytes:
+    """Return a golden file as if it had been moved already."""
+    container = read_container(read_golden_file(name), SECTION_CONTENTS)
+    placement = Placement(
+        3.0, Placement.rotation_about_axis((0.3, -1.0, 0.4), 130).rotation, np.array([3.0, -2.0, 0.5])
+    )
+    return with_metadata(container, read_config(container), move_provenance(placement, read_provenance(container)))
+
+
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dict[str, Any]]:
     """Save every file after every edit as the player does; return the source, the target and the answers of each."""
@@ -71,7 +91,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dic
         for edits, actions in EDITS.items():
             place = folder / str(len(cases))
             place.mkdir()
-            (place / "scene.hyrf").write_bytes((GOLDEN_FOLDER / name).read_bytes())
+            (place / "scene.hyrf").write_bytes(moved_file(name) if edits == "moved before" else read_golden_file(name))
             paths = {"source": str(place / "scene.hyrf"), "target": str(place / "saved.hyrf")}
             cases[name, edits] = {**paths, "actions": actions}
     (folder / "cases.json").write_text(json.dumps(list(cases.values())))

@@ -24,8 +24,8 @@ import numpy as np
 
 import hyrfpack
 from hyrfpack.blocks import run as blocks_run
+from hyrfpack.cameras.placement import Placement
 from hyrfpack.data import PictureCache
-from hyrfpack.edit.transform import Placement
 from hyrfpack.scene import Scene, evenly_spaced
 from tools.command import run_command
 from tools.scenes.layout_city import BLOCKS_PER_SIDE, PITCH_METRES

@@ -19,7 +19,8 @@ import numpy as np
 
 import hyrfpack
 from hyrfpack.cameras.paths import Viewpoint
-from hyrfpack.edit.transform import Placement
+from hyrfpack.cameras.placement import Placement
+from hyrfpack.edit.transform import move_frame, move_provenance
 from hyrfpack.format.arrays import parse_config
 from hyrfpack.format.container import Container, Section, read_container, write_container
 from hyrfpack.format.metadata import CODEC_DEFLATED, read_metadata
@@ -40,9 +41,9 @@ def list_offsets(copies: int, first: np.ndarray, second: np.ndarray) -> list[np.
 def move_file(container: Container, placement: Placement, shared: Container | None, shared_name: str) -> bytes:
     """Return the bytes of a chunk or a shared file that is placed elsewhere, with references to `shared`."""
     metadata = read_metadata(container)
-    frame = placement.move_frame(parse_config(metadata.config).frame)
+    frame = move_frame(placement, parse_config(metadata.config).frame)
     config = replace(parse_config(metadata.config), frame=frame).to_dict()
-    metadata = replace(metadata, config=config, provenance=placement.move_provenance(metadata.provenance))
+    metadata = replace(metadata, config=config, provenance=move_provenance(placement, metadata.provenance))
     sections: list[Section] = []
     for tag, entry in container.entries.items():
         if tag == METADATA:

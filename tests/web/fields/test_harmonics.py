@@ -16,8 +16,9 @@ from web.scripts import run_script
 import hyrfpack
 from hyrfpack.cameras.files import camera_to_json
 from hyrfpack.cameras.paths import Viewpoint, orbit
+from hyrfpack.cameras.placement import Placement
 from hyrfpack.cameras.view_sampling import shrink_camera
-from hyrfpack.edit.transform import Placement
+from hyrfpack.edit.transform import move_model
 from hyrfpack.export.bake import RIDGE_WEIGHT, SPHERE_DIRECTIONS, SPHERE_WEIGHT, bake
 from hyrfpack.export.measure import measure_psnr
 from hyrfpack.model import Frame, HybridModel
@@ -117,7 +118,7 @@ def test_splats_of_a_rotated_model_are_those_of_the_straight_one_in_its_axes(tmp
     step = Placement.rotation_about_axis((0.3, -1.0, 0.4), 130)
 
     before, _ = fit_in_node(model, cameras, 2, tmp_path)
-    after, facts = fit_in_node(step.move_model(model), [step.move_camera(camera) for camera in cameras], 2, tmp_path)
+    after, facts = fit_in_node(move_model(step, model), [step.move_camera(camera) for camera in cameras], 2, tmp_path)
 
     np.testing.assert_allclose(Frame((0, 0, 0), 1.0, (1, 1, 1), tuple(facts["rotation"])).axes, step.rotation)
     np.testing.assert_allclose(facts["center"], step.move_point(model.config.frame.center), rtol=1e-9)

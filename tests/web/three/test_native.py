@@ -23,9 +23,10 @@ from web.test_exposure import visible_map
 from web.three.test_three import app_folder, cameras_around_model, make_model, save_model
 
 import hyrfpack
+from hyrfpack.cameras.placement import Placement
 from hyrfpack.config.edit import Rotate, Scale, Translate
 from hyrfpack.edit import merge_models
-from hyrfpack.edit.transform import Placement
+from hyrfpack.edit.transform import move_model, move_provenance
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.background.reference import (
@@ -83,7 +84,7 @@ def address(app_folder: Path) -> Iterator[str]:
     write_page(app_folder)
     model, provenance = load_with_provenance(GOLDEN_FILE)
     step = Placement.rotation_about_axis((0.4, 1.0, -0.3), 77)
-    hyrfpack.save_model(step.move_model(model), app_folder / "rotated.hyrf", "raw", step.move_provenance(provenance))
+    hyrfpack.save_model(move_model(step, model), app_folder / "rotated.hyrf", "raw", move_provenance(step, provenance))
     with serve_project(app_folder) as address:
         yield f"{address}/own"
 

@@ -1,6 +1,6 @@
-// Moves the metadata of a file: its frame, its cameras and its viewpoint, as hyrfpack/edit/transform.py.
+// Moves the metadata of a file: its frame, cameras, viewpoint and stored placement, as hyrfpack/edit/transform.py.
 
-import { frameAxes, quatOf, rotateBy, transpose } from "../../hyrf/rotation.js";
+import { frameAxes, IDENTITY_QUAT, quatOf, rotateBy, transpose } from "../../hyrf/rotation.js";
 import { dot, mul } from "../../hyrf/vectors.js";
 import { defaultViewpoint } from "../../hyrf/viewpoint.js";
 
@@ -17,12 +17,27 @@ export function moveMetadata(metadata, placement, statesUp) {
   }
   if (statesUp) moved.viewpoint ??= storedForm(defaultViewpoint(config.frame));
   if (moved.viewpoint) moved.viewpoint = moveViewpoint(moved.viewpoint, placement, statesUp);
+  if (isMove(placement)) moved.placement = followPlacement(moved.placement, placement);
   return { ...metadata, config: { ...config, frame: moveFrame(config.frame, placement) }, provenance: moved };
 }
 
+// Returns whether a placement moves anything.
+const isMove = ({ factor, rows }) => factor !== 1 || rows.join() !== "1,0,0,0,1,0,0,0,1";
+
+// Returns the stored placement after a further move.
+function followPlacement(stored = { factor: 1, rotation: IDENTITY_QUAT, offset: [0, 0, 0] }, { factor, rows }) {
+  return {
+    factor: roundNumber(factor * stored.factor), rotation: turnBy(rows, stored).map(roundNumber),
+    offset: mul(rotateBy(rows, stored.offset), factor).map(roundNumber),
+  };
+}
+
+// Returns the quaternion of a rotation followed by that of `rows`.
+const turnBy = (rows, { rotation }) =>
+  quatOf(transpose(transpose(frameAxes({ rotation })).map((axis) => rotateBy(rows, axis))));
+
 function moveFrame(frame, { factor, rows }) {
-  const { rotation, ...rest } = frame, axes = transpose(frameAxes({ rotation })).map((axis) => rotateBy(rows, axis));
-  const quat = quatOf(transpose(axes));
+  const { rotation, ...rest } = frame, quat = turnBy(rows, frame);
   const isTurned = 2 * Math.hypot(...quat.slice(1)) >= MIN_TURN_RADIANS;
   const moved = { ...rest, center: mul(rotateBy(rows, frame.center), factor), scale: factor * frame.scale };
   return isTurned ? { ...moved, rotation: quat } : moved;

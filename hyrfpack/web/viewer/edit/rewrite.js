@@ -33,6 +33,7 @@ export async function rewriteFile(bytes, actions, writer) {
 // before, and `model` is what they decode to. `kept` has a byte for each Gaussian, 0 if it is removed.
 export function writeKept(bytes, { model, kept }, actions, writer) {
   const { config, rules, provenance } = editMetadata(model.metadata, actions);
+  if ("psnr" in provenance) provenance.psnr_before = "an edit"; // which has changed the model since it was measured
   const take = (numbers) => {
     const columns = numbers.length / kept.length;
     return numbers.filter((_, at) => kept[Math.floor(at / columns)]);
