@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from hyrfpack.bench.suite import BenchReport as BenchReport
     from hyrfpack.bench.suite import benchmark_model as benchmark_model
     from hyrfpack.blocks import train_blocks as train_blocks
+    from hyrfpack.cameras.capture import place_photos as place_photos
     from hyrfpack.compress import CompressionReport as CompressionReport
     from hyrfpack.compress import compress_model as compress_model
     from hyrfpack.config.compress import CompressConfig as CompressConfig
@@ -113,6 +114,7 @@ _MODULES_BY_PUBLIC_NAME = {
     "BenchReport": "hyrfpack.bench.suite",
     "benchmark_model": "hyrfpack.bench.suite",
     "train_blocks": "hyrfpack.blocks",
+    "place_photos": "hyrfpack.cameras.capture",
     "ComparisonReport": "hyrfpack.report",
     "compare_runs": "hyrfpack.report",
     "CompressionReport": "hyrfpack.compress",

@@ -55,6 +55,7 @@ def test_every_public_function_is_covered_here():
         "evaluate_model",
         "export_gallery",
         "export_player",
+        "place_photos",
         "render_view",
         "save_model",
         "select_levels",

@@ -281,6 +281,15 @@ def place_photos(facts: dict, scene: Scene | None) -> Scene | None:
     Args:
         facts: the result of `hyrfpack.describe_file`.
         scene: photos with the poses of training, or with poses in the coordinates of the model; or None.
+
+    Example:
+        >>> import hyrfpack
+        >>> from hyrfpack.config.edit import Center
+        >>> report = hyrfpack.edit_model("bonsai.hyrf", "centred.hyrf", [Center()])
+        >>> scene = hyrfpack.load_scene("photos/bonsai")
+        >>> placed = hyrfpack.place_photos(hyrfpack.describe_file("centred.hyrf"), scene)
+        >>> len(placed.test) == len(scene.test)
+        True
     """
     if scene is None:
         return None

@@ -56,14 +56,14 @@ def find_file_kind(
     target: str | os.PathLike[str],
     config: ExportConfig = ExportConfig(),  # noqa: B008 - frozen
     *,
-    other_endings: tuple[str, ...] = (),
+    endings: tuple[str, ...] = EXPORT_ENDINGS,
 ) -> FileKind:
     """Find the kind of file that the ending of `target` names; a folder or a name without ending means a player.
 
     Args:
         target: path of the output.
         config: settings of the export, which can name a kind of folder.
-        other_endings: further endings that the caller accepts, to be named in the error message.
+        endings: the endings that the caller accepts, to be named in the error message.
 
     Raises:
         HyrfError: the ending is none of EXPORT_ENDINGS, contradicts the kind of folder that `config` names, or is
@@ -90,7 +90,7 @@ def find_file_kind(
         return PLAYER_FOLDER
     raise HyrfError(
         f"{target}: the file extension does not name a known format",
-        fix=f"use one of {', '.join((*other_endings, *EXPORT_ENDINGS))}, or give a folder for a player",
+        fix=f"use one of {', '.join(endings)}, or give a folder for a player",
     )
 
 

@@ -262,7 +262,10 @@ class Container:
         if not start:
             raise self._damaged_error("the file is empty")
         if start[: len(MAGIC)] != MAGIC[: len(start)]:
-            raise HyrfFormatError(f"{self.name}: this is not a .hyrf file", fix="check the path, or write it again")
+            raise HyrfFormatError(
+                f"{self.name}: this is not a .hyrf file",
+                fix="check the path; files that were exported for other programs are not read",
+            )
         # The version is checked first, because another major version may change the layout of everything after it.
         if len(start) >= len(MAGIC) + _VERSION_STRUCT.size:
             major, minor = _VERSION_STRUCT.unpack_from(start, len(MAGIC))

@@ -15,7 +15,14 @@ from hyrfpack.config.train import TrainConfig
 from hyrfpack.data.folder import list_photos
 from hyrfpack.errors import HyrfDataError, HyrfError, suggest_command
 from hyrfpack.export.folder import check_folder
-from hyrfpack.export.kinds import PLAYER_FOLDER, TRANSFORMS_JSON, check_place, check_request, find_file_kind
+from hyrfpack.export.kinds import (
+    EXPORT_ENDINGS,
+    PLAYER_FOLDER,
+    TRANSFORMS_JSON,
+    check_place,
+    check_request,
+    find_file_kind,
+)
 from hyrfpack.format.min_file_size import check_target_bytes
 from hyrfpack.make.source import LoadSettings, Source
 from hyrfpack.make.stages import EXPORT_FOLDER, PACKED_MODEL
@@ -106,7 +113,8 @@ class Request:
         """Reject options that exclude each other or do not fit the source."""
         source = self.source
         if not self._is_model:
-            kind = find_file_kind(self.output, other_endings=(".hyrf",))
+            endings = (".hyrf", *(ending for ending in EXPORT_ENDINGS if ending != TRANSFORMS_JSON.ending))
+            kind = find_file_kind(self.output, endings=endings)
             if kind is TRANSFORMS_JSON:  # its paths of photos would be relative to the work folder
                 raise HyrfError(
                     f"{self.output}: this format holds only the cameras of the photos",
