@@ -118,7 +118,8 @@ export interface Viewer {
 
   /**
    * Loads another scene; the present one stays until it is ready. Rejects with a sentence for the user, which the event
-   * "error" has, too, or with an AbortError if yet another scene is loaded or the viewer is destroyed.
+   * "error" has, too, or with an AbortError if yet another scene is loaded or the viewer is destroyed. Either ends the
+   * request, and cancels a stream, of which no part is shown yet. Bytes and the arrays of a stream are copied.
    */
   load(source: Source, options?: { name?: string }): Promise<void>;
   /** Glides to a camera. Throws an error if it is invalid or there is no scene. */

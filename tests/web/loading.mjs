@@ -46,21 +46,22 @@ createLoader().read({ name: "scene.json", address, stage: null, stream: yieldMan
 await new Promise((done) => setTimeout(done, 50));
 const folderName = posted.find(({ stream }) => stream)?.stream.name ?? null;
 
-// Returns an answer that records in `cancelled` that its body is cancelled.
+// Returns an answer that records in `cancelled` that its request is aborted.
 const cancelled = [false, false];
-const answerWith = (pull, number, status) => {
-  const body = new ReadableStream({ pull, cancel: () => (cancelled[number] = true) }, { highWaterMark: 0 });
+const answerWith = (pull, number, status, { signal }) => {
+  signal.addEventListener("abort", () => (cancelled[number] = true));
+  const body = new ReadableStream({ pull }, { highWaterMark: 0 });
   return new Response(body, { status, headers: { "Content-Length": "100" } });
 };
-globalThis.fetch = async () => answerWith(() => {}, 0, 200);
+globalThis.fetch = async (address, options) => answerWith(() => {}, 0, 200, options);
 (await fetchedFile("http://host/a.hyrf")).stream.cancel?.();
 let pulls = 0;
 const breakOff = (controller) => {
   if (pulls++) controller.error(new Error("broken"));
   else controller.enqueue(new Uint8Array(10));
 };
-const answers = [answerWith(breakOff, 2, 200), answerWith(() => {}, 1, 200)];
-globalThis.fetch = async () => answers.shift();
+const answers = [[breakOff, 2], [() => {}, 1]];
+globalThis.fetch = async (address, options) => answerWith(...answers.shift(), 200, options);
 try {
   for await (const bytes of (await fetchedFile("http://host/a.hyrf")).stream) void bytes;
 } catch {

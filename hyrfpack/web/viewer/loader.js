@@ -115,7 +115,6 @@ export class Loader {
         this.connection.post({ bytes: own }, [own.buffer]);
       }
     } catch (error) {
-      source.return?.().catch(() => {}); // not awaited, because the source may be busy
       this.connection.post({ broken: true });
       this.fail(error);
       throw error;

@@ -170,12 +170,11 @@ export class Player extends EventTarget {
       this.failure = null;
       await loader.read({ name, scene, stage, plain: scene?.plain ?? false, stream, address });
     } catch (error) {
-      if (!loader) {
-        stream.cancel?.();
-      } else if (this.loader === loader) {
+      stream.cancel?.();
+      if (loader && this.loader === loader) {
         this.whole = true; // no more of the file will arrive
         this.redraw();
-      } else {
+      } else if (loader) {
         this.discard(loader);
       }
       if (!this.loader || this.loader.failure) this.giveUp(error);

@@ -1,6 +1,6 @@
 // Reads a scene's bytes from an address, a file or memory, as {name, stream, address}; the stream is an async iterable
 // of Uint8Array, whose `length` is the number of bytes, or 0 if that is unknown. Only fetched files have an address.
-// Their streams have a method `cancel`, which ends the download of a file that is not read.
+// Their streams have a method `cancel`, which ends the download at once, also while it waits for bytes.
 
 const FROM_DISK_TEXT = "a page opened from the disk may not read files; drop the file on the page, or serve both";
 // A sandbox without allow-same-origin makes every server, even the page's own, another site.
@@ -10,20 +10,18 @@ const OPAQUE_FRAME_TEXT = "the sandbox of the frame around this page forbids it;
 const UNNAMED_FILE = "the scene";
 
 // Opens an address (string or URL), a Blob or a File, bytes (ArrayBuffer or Uint8Array), or a ReadableStream of bytes.
-// `name` replaces the file's. Throws an Error with a message for the user on failure.
-export async function openSource(source, name) {
-  const file = await openUnnamed(source);
+// `name` replaces the file's. `aborter` ends the load. Throws an Error with a message for the user on failure.
+export async function openSource(source, name, aborter) {
+  const file = await openUnnamed(source, aborter);
   return { ...file, name: name ?? file.name };
 }
 
-async function openUnnamed(source) {
-  if (typeof source === "string" || source instanceof URL) return fetchedFile(absoluteAddress(source));
+async function openUnnamed(source, aborter) {
+  if (typeof source === "string" || source instanceof URL) return fetchedFile(absoluteAddress(source), aborter);
   if (source instanceof Blob) return chosenFile(source);
-  if (source instanceof ReadableStream) {
-    return { name: UNNAMED_FILE, stream: Object.assign(pieces(source), { length: 0 }) };
-  }
-  const isArray = source instanceof ArrayBuffer || ArrayBuffer.isView(source);
-  if (isArray) return chosenFile(new Blob([source])); // a copy, because the bytes are transferred to the worker
+  if (source instanceof ReadableStream) return streamedFile(source, aborter);
+  if (source instanceof ArrayBuffer) return chosenFile(new Blob([source]));
+  if (ArrayBuffer.isView(source)) return chosenFile(new Blob([copyBytes(source)])); // a Blob takes no shared memory
   throw new Error("A scene is an address, a Blob, an ArrayBuffer, a Uint8Array or a ReadableStream.");
 }
 
@@ -35,24 +33,43 @@ function absoluteAddress(source) {
   }
 }
 
+// Returns the file that a ReadableStream of the caller yields, who may use the same arrays elsewhere.
+function streamedFile(source, aborter) {
+  if (source.locked) throw new Error("The stream is locked, because something else reads it.");
+  const reader = source.getReader(), cancel = () => aborter.abort();
+  aborter.signal.onabort = () => reader.cancel().catch(() => {});
+  return { name: UNNAMED_FILE, stream: Object.assign(copyPieces(reader), { length: 0, cancel }) };
+}
+
+// Yields copies, because the bytes are transferred to the worker.
+async function* copyPieces(reader) {
+  for await (const value of pieces(reader)) {
+    if (!ArrayBuffer.isView(value)) throw new Error("the stream must yield Uint8Arrays.");
+    yield copyBytes(value);
+  }
+}
+
+const copyBytes = ({ buffer, byteOffset, byteLength }) => new Uint8Array(buffer, byteOffset, byteLength).slice();
+
 // Fetches a file. Throws an Error with a message for the user on failure.
-export async function fetchedFile(address) {
-  const name = nameOfAddress(address), answer = await request(address, name);
+export async function fetchedFile(address, aborter = new AbortController()) {
+  const name = nameOfAddress(address), answer = await request(address, name, aborter);
   if (!answer.ok) {
     const status = [answer.status, answer.statusText].filter(Boolean).join(" ");
-    discard(answer);
+    aborter.abort();
     throw new Error(`${name} could not be fetched (${status}); check the address ${address}`);
   }
   // For a compressed transfer, Content-Length is not the length of the file.
   const length = answer.headers.get("Content-Encoding") ? 0 : Number(answer.headers.get("Content-Length")) || 0;
-  const cancel = () => discard(answer);
-  const stream = Object.assign(downloaded(address, name, answer, length), { length, cancel });
+  const cancel = () => aborter.abort();
+  const stream = Object.assign(downloaded(address, name, answer, length, aborter), { length, cancel });
   return { name, stream, address: answer.url || address };
 }
 
 // Returns a file that the user chose.
 export function chosenFile(file) {
-  return { name: file.name ?? UNNAMED_FILE, stream: Object.assign(pieces(file.stream()), { length: file.size }) };
+  const stream = Object.assign(pieces(file.stream().getReader()), { length: file.size });
+  return { name: file.name ?? UNNAMED_FILE, stream };
 }
 
 // Decodes a name in an address. One whose percent signs are invalid stays as it is.
@@ -76,24 +93,21 @@ function noAnswerReason({ origin, host }) {
 }
 
 // Sends a request. Throws an Error with a message for the user if the server does not answer.
-async function request(address, name, headers = {}) {
+async function request(address, name, { signal }, headers = {}) {
   try {
-    return await fetch(address, { headers, credentials: "same-origin" });
+    return await fetch(address, { headers, credentials: "same-origin", signal });
   } catch {
     throw new Error(`${name} could not be fetched: ${noAnswerReason(new URL(address))}.`);
   }
 }
 
-// Ends the download of an answer that nobody has begun to read.
-const discard = (answer) => answer.body?.cancel().catch(() => {});
-
 // Yields the bytes of an answer. After a broken connection, the rest is requested once, by a range request.
-async function* downloaded(address, name, answer, length) {
+async function* downloaded(address, name, answer, length, aborter) {
   const isSameOrigin = new URL(address).origin === location.origin, tag = answer.headers.get("ETag");
   let done = 0;
   for (let isResumed = false; ; isResumed = true) {
     try {
-      for await (const bytes of pieces(answer.body)) {
+      for await (const bytes of pieces(answer.body.getReader())) {
         done += bytes.length;
         yield bytes;
       }
@@ -103,23 +117,22 @@ async function* downloaded(address, name, answer, length) {
     } catch {
       const sentence = `the connection broke after ${done.toLocaleString("en")} bytes; reload the page to try again`;
       const brokenError = new Error(sentence);
-      if (isResumed || !done) throw brokenError;
+      if (isResumed || !done || aborter.signal.aborted) throw brokenError;
       // If-Range is sent only to the page's own server, because other servers would have to allow it.
       const condition = isSameOrigin && tag && !tag.startsWith("W/") ? { "If-Range": tag } : {};
       const headers = { Range: `bytes=${done}-`, ...condition };
-      answer = await request(address, name, headers);
+      answer = await request(address, name, aborter, headers);
       const first = answer.headers.get("Content-Range");
       if (answer.status !== 206 || (first && !first.startsWith(`bytes ${done}-`))) {
-        discard(answer);
+        aborter.abort();
         throw brokenError;
       }
     }
   }
 }
 
-// Iterates over a ReadableStream, because not every browser supports `for await` with streams.
-async function* pieces(stream) {
-  const reader = stream.getReader();
+// Iterates over a ReadableStream by its reader, because not every browser supports `for await` with streams.
+async function* pieces(reader) {
   try {
     for (;;) {
       const { done, value } = await reader.read();

@@ -57,7 +57,8 @@ class Viewer {
     this.listeners = new Map(EVENTS.map((event) => [event, new Set()]));
     this.firstCamera = camera; // for the first scene
     this.progress = 0;
-    // The load whose scene is wanted: {isComplete, isReported: whether "ready" was emitted}, `origin` of its loader.
+    // The load whose scene is wanted, `origin` of its loader: {aborter, reject: rejects its promise, isComplete,
+    // isReported: whether "ready" was emitted}.
     this.currentLoad = null;
     this.screenshots = 0; // those that are being made
     this.isReady = false;
@@ -147,19 +148,41 @@ class Viewer {
     else this.player.resume();
   }
 
-  async load(src, { name } = {}) {
+  async load(src, options) {
     if (this.isDestroyed) throw new Error("The viewer has been destroyed; create another one.");
-    const { player } = this, thisLoad = { isComplete: false, isReported: false };
-    const isDropped = () => this.currentLoad !== thisLoad;
-    this.currentLoad = thisLoad;
-    if (player.next) player.discard(player.next); // an earlier scene that is not shown yet
+    this.dropLoad();
+    const load = { aborter: new AbortController(), isComplete: false, isReported: false };
+    const dropped = new Promise((_, reject) => (load.reject = reject));
+    this.currentLoad = load;
     this.pending = null;
     this.isReady = false;
     this.progress = 0;
+    await Promise.race([this.show(load, src, options?.name), dropped]);
+  }
+
+  // Aborts the current load and rejects its promise, unless a part of its scene is shown: then the rest still loads, in
+  // case the next load fails.
+  dropLoad() {
+    const { player, currentLoad } = this;
+    if (player.next) player.discard(player.next); // an earlier scene that is not shown yet
+    if (currentLoad && !this.isCurrentShown) {
+      currentLoad.reject(newAbortError());
+      currentLoad.aborter.abort();
+    }
+    this.currentLoad = null;
+  }
+
+  // Whether the scene of the last load is shown, at least a part of it, and not an earlier scene.
+  get isCurrentShown() {
+    return this.currentLoad !== null && this.player.loader?.origin === this.currentLoad;
+  }
+
+  async show(load, src, name) {
+    const { player } = this, isDropped = () => this.currentLoad !== load;
     try {
-      const file = await openSource(src, name);
-      if (isDropped()) file.stream.cancel?.();
-      else await player.open({ ...file, origin: thisLoad });
+      const file = await openSource(src, name, load.aborter);
+      if (isDropped()) return;
+      await player.open({ ...file, origin: load });
     } catch (error) {
       if (isDropped() || error instanceof SupersededError) throw newAbortError();
       this.currentLoad = player.loader?.origin ?? null; // the scene that is shown stays; it may still be loading
@@ -169,7 +192,7 @@ class Viewer {
       this.reportReady();
       throw error;
     }
-    thisLoad.isComplete = true;
+    load.isComplete = true;
     if (isDropped()) throw newAbortError();
     this.isReady = true;
     this.reportReady();
@@ -258,8 +281,8 @@ class Viewer {
 
   destroy() {
     if (this.isDestroyed) return;
+    this.dropLoad();
     this.isDestroyed = true;
-    this.currentLoad = null;
     this.pending = null;
     this.observer.disconnect();
     this.navigation.dispose();
