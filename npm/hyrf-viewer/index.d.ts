@@ -122,7 +122,7 @@ export interface Viewer {
    * request, and cancels a stream, of which no part is shown yet. Bytes and the arrays of a stream are copied.
    */
   load(source: Source, options?: { name?: string }): Promise<void>;
-  /** Glides to a camera. Throws an error if it is invalid or there is no scene. */
+  /** Glides to a camera in `seconds`, at once for 0. Throws an error if one is invalid or there is no scene. */
   moveTo(camera: CameraName, options?: { seconds?: number }): void;
   /** Returns the visible point at a place of the canvas in CSS pixels, in world units, or null if there is none. */
   pick(x: number, y: number): [number, number, number] | null;
@@ -131,10 +131,13 @@ export interface Viewer {
   /** Stops drawing until `resume`. */
   pause(): void;
   resume(): void;
-  /** Calls a listener with each event of a kind. Returns a function that ends this. */
+  /**
+   * Calls a listener with each event of a kind. Returns a function that ends this. Errors of listeners are reported as
+   * those of other events are, by the window's event "error".
+   */
   on<Name extends keyof ViewerEvents>(event: Name, listener: (detail: ViewerEvents[Name]) => void): () => void;
   off<Name extends keyof ViewerEvents>(event: Name, listener: (detail: ViewerEvents[Name]) => void): void;
-  /** Removes the canvas and frees workers and graphics memory. */
+  /** Removes the canvas and frees workers and graphics memory. Then there is no scene, and none can be loaded. */
   destroy(): void;
 }
 

@@ -152,16 +152,28 @@ SOURCES_JS = {
     "a Blob": "await (await fetch('some scene.hyrf')).blob()",
     "an ArrayBuffer": "await (await fetch('some scene.hyrf')).arrayBuffer()",
     "bytes": "new Uint8Array(await (await fetch('some scene.hyrf')).arrayBuffer())",
+    "shared memory": "shareBytes(new Uint8Array(await (await fetch('some scene.hyrf')).arrayBuffer()))",
     "a stream": "(await fetch('some scene.hyrf')).body",
 }
 
 
+SHARE_BYTES_JS = """window.shareBytes = (bytes) => {
+  const { buffer } = new WebAssembly.Memory({ initial: 8, maximum: 8, shared: true });
+  const shared = new Uint8Array(buffer, 0, bytes.length);
+  shared.set(bytes);
+  return shared;
+};
+"""
+
+
 @pytest.mark.parametrize("kind", SOURCES_JS)
 def test_scenes_are_loaded_from(browser: Browser, site: Site, kind: str):
-    open_viewer(browser, site, "window.viewer = createViewer({ container: document.getElementById('box') });")
+    open_viewer(
+        browser, site, SHARE_BYTES_JS + "window.viewer = createViewer({ container: document.getElementById('box') });"
+    )
     browser.evaluate(f"(async () => {{ window.src = {SOURCES_JS[kind]}; await viewer.load(src); }})()")
     assert browser.evaluate("viewer.scene.kind") == "hyrf"
-    if kind == "bytes":
+    if "bytes" in kind or "shared" in kind:
         assert browser.evaluate("src.length") > 0, "the caller's bytes were taken away"
 
 
@@ -345,6 +357,23 @@ def test_an_invalid_camera_is_refused(browser: Browser, site: Site):
     assert "There is no camera 99" in error_of(browser, "viewer.moveTo(99)")
     assert error_of(browser, "viewer.moveTo('99')").startswith("The camera 99 cannot be used: there is no camera 99")
     assert "camera_from_world" in error_of(browser, "viewer.moveTo({ width: 3 })")
+    for camera in ("undefined", "null", "true"):
+        assert f"A camera is a number, a text or an object, not {camera}" in error_of(
+            browser, f"viewer.moveTo({camera})"
+        )
+    assert "seconds must be a finite number" in error_of(browser, "viewer.moveTo(0, { seconds: Infinity })")
+    assert browser.evaluate("viewer.screenshot().then(({ type }) => type)") == "image/png"
+
+
+def test_a_container_may_be_in_a_frame(browser: Browser, site: Site):
+    script = (
+        "const frame = document.createElement('iframe'); document.body.append(frame);"
+        "frame.contentDocument.body.innerHTML = '<div style=\"height: 100px\"></div>';"
+        "window.viewer = createViewer({ container: frame.contentDocument.querySelector('div'), src: 'cloud.spz' });"
+    )
+    open_viewer(browser, site, script)
+    wait_until(browser, READY_JS)
+    assert browser.evaluate("viewer.screenshot().then(({ size }) => size)") > 1000
 
 
 # ---- several viewers
@@ -425,6 +454,9 @@ def test_destroy_ends_everything_and_can_be_repeated(browser: Browser, site: Sit
     assert "the viewer was destroyed" in browser.evaluate("pending")
     assert browser.evaluate("gl.isContextLost() && workers.alive === 0 && !document.querySelector('canvas')")
     assert "destroyed" in error_of(browser, "viewer.load('cloud.spz')")
+    assert "destroyed" in error_of(browser, "viewer.moveTo(0)")
+    state = "[viewer.isReady, viewer.progress, viewer.scene, viewer.camera, viewer.cameraText]"
+    assert browser.evaluate(state) == [False, 0, None, None, None]
     browser.evaluate("dispatchEvent(new Event('resize'))")
     assert browser.list_errors() == []
 

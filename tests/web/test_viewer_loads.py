@@ -30,12 +30,27 @@ def test_the_arrays_of_a_stream_stay_those_of_the_page(loads: dict):
     assert loads["kept"] == [10, 15]
 
 
+def test_an_error_of_a_listener_is_reported_and_changes_nothing_else(loads: dict):
+    assert loads["listeners"]["called"] == ["first", "second"]
+    assert loads["listeners"]["reported"] == ["an error of the page"]
+    assert loads["listeners"]["loadError"].startswith("A scene is an address")
+
+
 @pytest.mark.parametrize(
     ("what", "words"),
     [
+        ("no options", "createViewer needs a container: element or selector."),
+        ("an empty selector", "createViewer needs a container: element or selector."),
+        ("no listener", 'The listener of "ready" must be a function.'),
+        ("no load options", "A scene is an address"),
         ("a stream of texts", "the scene cannot be opened: the stream must yield Uint8Arrays."),
         ("a locked stream", "The stream is locked"),
+        ("a destroyed viewer", "The viewer has been destroyed"),
     ],
 )
 def test_wrong_arguments_are_refused_by_a_sentence(loads: dict, what: str, words: str):
     assert loads["wrong"][what].startswith(words)
+
+
+def test_a_policy_that_requires_trusted_types_is_named(loads: dict):
+    assert "requires Trusted Types" in loads["refusal"]

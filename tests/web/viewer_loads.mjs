@@ -6,9 +6,12 @@
 //     `stalled`: the same for a download that has begun
 //     `streams`: the same for the streams of an application, of which nothing was read and of which a part was read
 //     `kept`: the lengths of the arrays of an application after its stream was loaded
+//     `listeners`: which listeners of an error were called, the errors that the page reports, and that of the load
 //     `wrong`: the errors of arguments that are not valid
+//     `refusal`: the error of a page on which only trusted types may start a worker
 
-globalThis.Element = class extends EventTarget {
+class FakeElement extends EventTarget {
+  nodeType = 1;
   style = {};
 
   setAttribute() {}
@@ -16,23 +19,29 @@ globalThis.Element = class extends EventTarget {
   append() {}
 
   remove() {}
-};
+}
 class Observer {
   observe() {}
 
   disconnect() {}
 }
-const wait = (ms = 20) => new Promise((resolve) => setTimeout(resolve, ms));
+const reported = [], wait = (ms = 20) => new Promise((resolve) => setTimeout(resolve, ms));
 globalThis.window = globalThis.self = globalThis;
+globalThis.Node = { ELEMENT_NODE: 1 };
 globalThis.document = {
   baseURI: "http://host/",
-  createElement: () => new Element(),
+  createElement: () => new FakeElement(),
+  querySelector: (selector) => {
+    if (!selector) throw new DOMException("it is not a valid selector", "SyntaxError");
+    return null;
+  },
 };
 globalThis.location = new URL("http://host/");
 globalThis.navigator ??= { hardwareConcurrency: 2 };
 globalThis.matchMedia = () => ({ matches: false });
 globalThis.addEventListener = globalThis.removeEventListener = () => {};
 globalThis.IntersectionObserver = globalThis.ResizeObserver = Observer;
+globalThis.reportError = ({ message }) => reported.push(message);
 globalThis.Worker = class {
   postMessage(message, transfer) {
     structuredClone(message, { transfer });
@@ -51,7 +60,7 @@ class FakeRenderer {
 
   dispose() {}
 }
-const makeViewer = () => createViewer({ container: new Element(), renderer: FakeRenderer });
+const makeViewer = () => createViewer({ container: new FakeElement(), renderer: FakeRenderer });
 const errorOf = (promise) => Promise.race([promise.then(() => "none", ({ name }) => name), wait(1000)]);
 
 // Servers that do not answer, or that send only the beginning of a file.
@@ -106,17 +115,41 @@ makeViewer().load(makeStream(0, own)).catch(() => {});
 await wait();
 result.kept = own.map(({ length }) => length);
 
+const viewer = makeViewer(), called = [];
+viewer.on("error", () => {
+  called.push("first");
+  throw new Error("an error of the page");
+});
+viewer.on("error", () => called.push("second"));
+const loadError = await viewer.load(42).catch(({ message }) => message);
+result.listeners = { called: [...called], reported: [...reported], loadError };
+
 const texts = new ReadableStream({ start: (controller) => controller.enqueue("text") });
 const locked = new ReadableStream();
 locked.getReader();
 const calls = {
-  "a stream of texts": () => makeViewer().load(texts),
-  "a locked stream": () => makeViewer().load(locked),
+  "no options": () => createViewer(),
+  "an empty selector": () => createViewer({ container: "" }),
+  "no listener": () => viewer.on("ready", null),
+  "no load options": () => viewer.load(42, null),
+  "a stream of texts": () => viewer.load(texts),
+  "a locked stream": () => viewer.load(locked),
+  "a destroyed viewer": () => {
+    viewer.destroy();
+    viewer.moveTo(0);
+  },
 };
 result.wrong = {};
 for (const [what, call] of Object.entries(calls)) {
   result.wrong[what] = await (async () => call())().then(() => "", ({ message }) => message);
 }
+
+globalThis.Worker = class {
+  constructor() {
+    throw new TypeError("This document requires 'TrustedScriptURL' assignment.");
+  }
+};
+result.refusal = await makeViewer().load(new Blob([])).catch(({ message }) => message);
 
 console.log(JSON.stringify(result));
 process.exit();

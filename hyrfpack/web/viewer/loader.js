@@ -9,6 +9,7 @@ export class SupersededError extends Error {}
 // The browser cannot read any file. The message is for the user.
 export class StartError extends Error {}
 
+const TRUSTED_TYPES_TEXT = "A Content-Security-Policy requires Trusted Types, which the player does not support.";
 const NO_EMBEDDED_WORKER_TEXT =
   "A Content-Security-Policy forbids the player's worker; it must allow worker-src blob:.";
 
@@ -36,8 +37,8 @@ export class Loader {
     const fail = (message) => this.breakDown(message ? failureOf(message) : new StartError(refusal));
     try {
       this.connection = new Connection(workerAddress, receive, fail);
-    } catch {
-      throw new StartError(refusal);
+    } catch (error) {
+      throw new StartError(error instanceof TypeError ? TRUSTED_TYPES_TEXT : refusal);
     }
     this.delivered = Promise.resolve();
     this.broken = false; // true if no more of the file will arrive; the part that was shown can be decoded again

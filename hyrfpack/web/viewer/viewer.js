@@ -20,7 +20,7 @@ const CANVAS_STYLE = { display: "block", width: "100%", height: "100%" };
 
 // Creates a viewer in an element. `options` are those that the constructor lists. Throws an Error with a message for
 // the user if one is invalid, or if the browser cannot draw.
-export const createViewer = (options) => new Viewer(options);
+export const createViewer = (options) => new Viewer(options ?? {});
 
 class Viewer {
   constructor({
@@ -28,8 +28,7 @@ class Viewer {
     interaction = "after-click", loading = "eager", title = "3D scene", workerUrl = null, maxGaussians = null,
     renderer = Renderer,
   }) {
-    this.container = typeof container === "string" ? document.querySelector(container) : container;
-    if (!(this.container instanceof Element)) throw new Error("createViewer needs a container: element or selector.");
+    this.container = findContainer(container);
     checkChoice("exposure", exposure, EXPOSURES);
     checkChoice("interaction", interaction, INTERACTIONS);
     checkChoice("loading", loading, LOADINGS);
@@ -118,12 +117,20 @@ class Viewer {
     });
   }
 
+  // Calls the listeners of an event. The page reports their errors, as those of other events.
   emit(event, detail) {
-    for (const listener of [...this.listeners.get(event)]) listener(detail);
+    for (const listener of [...this.listeners.get(event)]) {
+      try {
+        listener(detail);
+      } catch (error) {
+        reportError(error);
+      }
+    }
   }
 
   on(event, listener) {
     checkChoice("event", event, EVENTS);
+    if (typeof listener !== "function") throw new Error(`The listener of "${event}" must be a function.`);
     this.listeners.get(event).add(listener);
     return () => this.off(event, listener);
   }
@@ -149,7 +156,7 @@ class Viewer {
   }
 
   async load(src, options) {
-    if (this.isDestroyed) throw new Error("The viewer has been destroyed; create another one.");
+    if (this.isDestroyed) throw new Error(DESTROYED_TEXT);
     this.dropLoad();
     const load = { aborter: new AbortController(), isComplete: false, isReported: false };
     const dropped = new Promise((_, reject) => (load.reject = reject));
@@ -206,8 +213,13 @@ class Viewer {
     this.emit("ready", { scene: this.scene });
   }
 
+  // The player's scene, or null if none is shown.
+  get shownScene() {
+    return this.isDestroyed ? null : this.player.scene;
+  }
+
   get scene() {
-    const { scene, cameras } = this.player;
+    const { shownScene: scene, player: { cameras } } = this;
     if (!scene) return null;
     const { title, kind, count, up, target } = scene;
     const hasExposureMap = this.player.hasExposureMap;
@@ -215,7 +227,7 @@ class Viewer {
   }
 
   get camera() {
-    return this.player.scene && this.player.viewed;
+    return this.shownScene && this.player.viewed;
   }
 
   set camera(camera) {
@@ -224,13 +236,17 @@ class Viewer {
 
   // The text by which links name the camera, or null while there is no scene.
   get cameraText() {
-    return this.player.scene && formatCamera(this.player.eye, this.player.scene);
+    return this.shownScene && formatCamera(this.player.eye, this.shownScene);
   }
 
-  moveTo(camera, { seconds } = {}) {
-    const { player } = this;
-    if (!player.scene) throw new Error("The viewer has no scene yet; wait for 'ready'.");
-    this.navigation.moveTo(readCamera(camera, player.scene), seconds);
+  moveTo(camera, options) {
+    if (this.isDestroyed) throw new Error(DESTROYED_TEXT);
+    const { scene } = this.player, seconds = options?.seconds;
+    if (!scene) throw new Error("The viewer has no scene yet; wait for 'ready'.");
+    if (seconds !== undefined && !Number.isFinite(seconds)) {
+      throw new Error(`seconds must be a finite number, not ${String(seconds)}.`);
+    }
+    this.navigation.moveTo(readCamera(camera, scene), seconds);
   }
 
   // Whether the eye turns slowly about its target.
@@ -283,6 +299,8 @@ class Viewer {
     if (this.isDestroyed) return;
     this.dropLoad();
     this.isDestroyed = true;
+    this.isReady = false;
+    this.progress = 0;
     this.pending = null;
     this.observer.disconnect();
     this.navigation.dispose();
@@ -292,12 +310,25 @@ class Viewer {
   }
 }
 
+const DESTROYED_TEXT = "The viewer has been destroyed; create another one.";
 const CANCELLED_TEXT = "The load was cancelled: another scene was loaded, or the viewer was destroyed.";
 const newAbortError = () => new DOMException(CANCELLED_TEXT, "AbortError");
 
 // Throws an Error if a value is not one of the allowed ones.
 function checkChoice(name, value, allowed) {
   if (!allowed.includes(value)) throw new Error(`${name} must be ${allowed.join(", ")}, not ${String(value)}.`);
+}
+
+// Returns the element that `container` is, or that it selects. It may be in a frame, whose elements have other classes.
+function findContainer(container) {
+  let element = container;
+  try {
+    if (typeof container === "string") element = document.querySelector(container);
+  } catch {
+    element = null; // the selector is invalid
+  }
+  if (element?.nodeType === Node.ELEMENT_NODE) return element;
+  throw new Error("createViewer needs a container: element or selector.");
 }
 
 function resolveWorker(address) {
@@ -317,7 +348,10 @@ function readCamera(camera, scene) {
       throw new Error(`The camera ${camera} cannot be used: ${message}.`);
     }
   }
-  if (typeof camera !== "number") return { view: viewOf(camera, scene) };
+  if (camera === null || !["number", "object"].includes(typeof camera)) {
+    throw new Error(`A camera is a number, a text or an object, not ${String(camera)}.`);
+  }
+  if (typeof camera === "object") return { view: viewOf(camera, scene) };
   if (Number.isInteger(camera) && camera >= 0 && camera < scene.cameras.length) return { number: camera };
   throw new Error(`There is no camera ${camera}; the scene has cameras 0 to ${scene.cameras.length - 1}.`);
 }
