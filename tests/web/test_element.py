@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import io
+import threading
+import time
 
 import pytest
 from PIL import Image
 from web.pages import Browser, wait_until
 from web.site import GOLDEN_FILE_DATA, Site
+from web.viewer_pages import serve_modules
 
 pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
 ELEMENT_JS = "document.querySelector('hyrf-viewer')"
@@ -305,3 +308,91 @@ def test_the_element_works_under_a_policy_of_self(browser: Browser, host: Site):
     browser.open(f"{host.address}/strict.html")
     wait_until(browser, LOADED_JS)
     assert not browser.evaluate("fired.some(([name]) => name === 'error')")
+
+
+class HeldServer(dict):
+    """Files of a server that answers requests for one path only after `release`."""
+
+    def __init__(self, host: Site, path: str) -> None:
+        super().__init__(host.files)
+        self.path, self.released = path, threading.Event()
+
+    def get(self, path: str, default: bytes | None = None) -> bytes | None:
+        if path == self.path:
+            self.released.wait(30)
+        return super().get(path, default)
+
+    def release(self) -> None:
+        self.released.set()
+
+
+def hold(host: Site, path: str) -> HeldServer:
+    host.files = HeldServer(host, path)
+    return host.files
+
+
+def wait_for_request(host: Site, path: str) -> None:
+    end = time.monotonic() + 20
+    while not any(requested == path for requested, _ in host.requests):
+        assert time.monotonic() < end, f"{path} was not requested"
+        time.sleep(0.02)
+
+
+def test_a_camera_that_is_set_while_another_scene_loads_is_its_first_one(browser: Browser, host: Site):
+    open_element(browser, host)
+    wait_until(browser, LOADED_JS)
+    server = hold(host, "/some scene.hyrf")
+    browser.evaluate(f"fired.length = 0, {ELEMENT_JS}.setAttribute('src', 'some scene.hyrf')")
+    wait_for_request(host, "/some scene.hyrf")
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('camera', '99')")  # which the scene that is shown lacks, too
+    browser.evaluate("new Promise((done) => setTimeout(done, 50))")
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('camera', '0.5,0.2,-3,1,0,0,0,1.2,3')")
+    browser.evaluate("new Promise((done) => setTimeout(done, 50))")
+    server.release()
+    wait_until(browser, LOADED_JS)
+    camera = browser.evaluate(f"{ELEMENT_JS}.viewer.cameraText").split(",")
+    assert [float(text) for text in camera[:7]] == pytest.approx([0.5, 0.2, -3, 1, 0, 0, 0], abs=1e-3)
+    assert not browser.evaluate("fired.some(([name]) => name === 'error')")
+
+
+@pytest.mark.parametrize("attributes", ["", "frame"])
+def test_an_element_with_an_empty_src_fetches_nothing(browser: Browser, host: Site, attributes: str):
+    open_element(browser, host, f'src="" {attributes}')
+    browser.evaluate("new Promise((done) => setTimeout(done, 300))")
+    assert browser.evaluate("fired") == []
+    assert [path for path, _ in host.requests].count("/post.html") == 1
+
+
+def test_a_frame_whose_src_is_no_address_shows_nothing_until_it_is_corrected(browser: Browser, host: Site):
+    open_element(browser, host, 'frame src="http://"')
+    wait_until(browser, "fired.some(([name, detail]) => name === 'error' && detail.includes('no address of a file'))")
+    assert browser.evaluate(f"{ELEMENT_JS}.shadowRoot.querySelector('iframe') === null")
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('src', 'cloud.spz')")
+    wait_until(browser, LOADED_JS)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "words"),
+    [('camera="99"', "no camera 99"), ('camera="%"', "The camera"), ('exposure="dark"', "exposure")],
+)
+def test_a_frame_fires_the_error_of_a_wrong_attribute_and_shows_the_scene(
+    browser: Browser, host: Site, attribute: str, words: str
+):
+    open_element(browser, host, f'src="cloud.spz" frame {attribute}')
+    wait_until(browser, LOADED_JS)
+    wait_until(browser, f"fired.some(([name, detail]) => name === 'error' && detail.includes('{words}'))")
+
+
+def test_an_element_in_a_module_of_any_name_has_its_worker_inside(browser: Browser, host: Site):
+    serve_modules(host)
+    host.files["/own/hyrf-viewer.js"] = (
+        b'import { defineElement } from "/viewer/element.js"; import { setTextSource } from "/viewer/texts.js";'
+        b'const texts = await (await fetch("/texts.json")).json(); setTextSource((name) => texts[name]);'
+        b"defineElement();"
+    )
+    body = '<hyrf-viewer src="cloud.spz"></hyrf-viewer>'
+    page = PAGE.replace('src="/hyrf-viewer.js"', 'type="module" src="/own/hyrf-viewer.js"').format(body=body)
+    host.files["/post.html"] = page.encode()
+    browser.open(f"{host.address}/post.html")
+    wait_until(browser, "fired.some(([name]) => name === 'load' || name === 'error')")
+    assert browser.evaluate(LOADED_JS), browser.evaluate("fired")

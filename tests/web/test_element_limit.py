@@ -7,6 +7,7 @@ import base64
 import pytest
 from web.pages import Browser, wait_until
 from web.site import Site
+from web.test_element import hold, wait_for_request
 
 ELEMENT_COUNT = 20
 MAX_SCENES = 12  # must equal MAX_SCENES in element_limit.js
@@ -80,6 +81,26 @@ def test_an_element_that_comes_back_keeps_its_camera(one_browser: Browser, host:
     show_element(one_browser, 0)
     found = one_browser.evaluate("elementAt(0).viewer.cameraText")
     assert [float(part) for part in found.split(",")] == pytest.approx([float(part) for part in text.split(",")])
+
+
+def test_an_element_that_is_suspended_while_another_scene_loads_opens_it_at_its_own_camera(
+    one_browser: Browser, host: Site
+):
+    open_elements(one_browser, host)
+    wait_until(one_browser, "isDrawn(0)")
+    one_browser.evaluate("elementAt(0).viewer.camera = '0.5,0.2,-3,1,0,0,0,1.2,3'")
+    server = hold(host, "/some scene.hyrf")
+    one_browser.evaluate("elementAt(0).setAttribute('src', 'some scene.hyrf')")
+    wait_for_request(host, "/some scene.hyrf")
+    for number in range(1, MAX_SCENES + 2):
+        show_element(one_browser, number)
+    assert one_browser.evaluate("elementAt(0).viewer") is None
+    server.release()
+    show_element(one_browser, 0)
+    first, chosen = one_browser.evaluate(
+        "(({ viewer }, first = viewer.cameraText) => (viewer.camera = 0, [first, viewer.cameraText]))(elementAt(0))"
+    )
+    assert [float(part) for part in first.split(",")] == pytest.approx([float(part) for part in chosen.split(",")])
 
 
 def test_a_visible_element_beyond_the_limit_says_that_it_waits(one_browser: Browser, host: Site):

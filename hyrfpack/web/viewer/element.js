@@ -32,6 +32,7 @@ const ELEMENT_CSS = `
 
 // The class exists without a browser, too, so that servers can import the package.
 class HyrfViewerElement extends (globalThis.HTMLElement ?? class {}) {
+  static workerAddress = null; // of the worker's script for elements without the attribute; null: the embedded one
   static observedAttributes = [...new Set(["frame", ...INLINE_ATTRIBUTES, ...FRAME_ATTRIBUTES])];
 
   constructor() {
@@ -83,8 +84,10 @@ class HyrfViewerElement extends (globalThis.HTMLElement ?? class {}) {
   }
 }
 
-// Defines the element, once for a page.
-export function defineElement() {
+// Defines the element, once for a page. `workerAddress` is for elements without the attribute `worker`.
+export function defineElement(workerAddress = null) {
   const registry = globalThis.customElements;
-  if (registry && !registry.get("hyrf-viewer")) registry.define("hyrf-viewer", HyrfViewerElement);
+  if (!registry || registry.get("hyrf-viewer")) return;
+  HyrfViewerElement.workerAddress = workerAddress;
+  registry.define("hyrf-viewer", HyrfViewerElement);
 }

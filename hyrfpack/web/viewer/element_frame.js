@@ -43,6 +43,7 @@ export class FrameView {
         address.searchParams.set(parameter, new URL(value, document.baseURI));
       } catch {
         this.fail(`${name} is no address of a file: ${value}`);
+        if (name === "src") return this.removeFrame(); // without its parameter, the player would show its own scene
       }
     }
     if (element.title) address.searchParams.set("title", element.title);
@@ -65,14 +66,15 @@ export class FrameView {
   // Before the frame is loaded, a new `src` adds none, and a lazy frame goes on waiting.
   show({ href, hash }) {
     const before = this.address;
-    this.address = href;
     if (href === before) return;
     if (hash && withoutHash(href) === withoutHash(before)) {
+      this.address = href;
       if (this.isLoaded) this.replaceAddress();
       else this.frame.src = href;
       return;
     }
     this.removeFrame();
+    this.address = href;
     this.isAnswered = this.isLoaded = false;
     this.frame = document.createElement("iframe");
     this.frame.allow = "fullscreen; clipboard-write; web-share";
@@ -99,6 +101,8 @@ export class FrameView {
   removeFrame() {
     clearTimeout(this.timer);
     this.frame?.remove();
+    this.frame = null;
+    this.address = "";
   }
 
   noPlayerText() {

@@ -5,7 +5,6 @@ import { MAX_SCENES, addView, assignScenes, handleLostContext, removeView } from
 import { AS_PHOTOGRAPHED } from "./exposure.js";
 import { prefersReducedMotion } from "./motion.js";
 import { keepPlaced } from "./poster.js";
-import { siblingAddress } from "./script_address.js";
 
 export const INLINE_ATTRIBUTES = [
   "src", "camera", "poster", "title", "exposure", "autorotate", "interaction", "loading", "worker",
@@ -25,7 +24,7 @@ export class InlineView {
     this.isEager = false; // whether a pending scene is also shown far from the window
     this.cameraText = null; // the camera of the scene before it was suspended
     this.isFailed = false; // whether the message is an error
-    this.wrongAttribute = null; // the name of the attribute whose value is the error, null for another error
+    this.wrongAttribute = null; // the name of the attribute whose value is wrong, null for an error of the load
     this.isLost = false; // whether the browser has taken the graphics context away
     const make = (name, attributes = {}) => {
       const made = document.createElement(name);
@@ -62,7 +61,9 @@ export class InlineView {
 
   // Frees the viewer until the element is near the window again, and the page has room for it.
   suspend() {
-    this.cameraText = this.viewer?.cameraText ?? this.cameraText;
+    // While another scene loads, and after it has failed, the scene that is shown is not that of `src`.
+    const isLoadFailed = this.isFailed && !this.wrongAttribute;
+    if (this.viewer?.isCurrentShown && !isLoadFailed) this.cameraText = this.viewer.cameraText;
     this.close();
     this.isPending = true;
     this.isEager = false;
@@ -84,6 +85,7 @@ export class InlineView {
   update() {
     const { element, shown: before } = this;
     const now = Object.fromEntries(INLINE_ATTRIBUTES.map((name) => [name, element.getAttribute(name)]));
+    now.src ||= null; // an empty address would be that of the page
     this.shown = now;
     if (now.src !== before.src || now.camera !== before.camera) this.cameraText = null;
     if (now.src === null || FIXED_ATTRIBUTES.some((name) => now[name] !== before[name])) this.close();
@@ -109,18 +111,22 @@ export class InlineView {
   attempt(name, follow) {
     try {
       follow();
-      if (this.isFailed && this.wrongAttribute === name) {
-        this.isFailed = false;
-        this.message.hidden = true;
-      }
+      this.hideError(name);
     } catch (error) {
       this.fail(error, name);
     }
   }
 
-  // Moves the eye to the camera of the attribute, or begins there if there is no scene yet.
+  // Hides the error of an attribute, if it is shown.
+  hideError(name) {
+    if (!this.isFailed || this.wrongAttribute !== name) return;
+    this.isFailed = false;
+    this.message.hidden = true;
+  }
+
+  // Moves the eye to the camera of the attribute, or begins there if the scene is not shown yet.
   moveTo(camera) {
-    if (!this.viewer.scene) this.viewer.firstCamera = camera;
+    if (!this.viewer.isCurrentShown) this.viewer.firstCamera = camera;
     else if (camera !== null) this.viewer.moveTo(camera);
   }
 
@@ -134,7 +140,7 @@ export class InlineView {
       autorotate: autorotate !== null,
       interaction: interaction ?? undefined,
       loading: loading ?? undefined,
-      workerUrl: worker ?? siblingAddress("player-worker.js"),
+      workerUrl: worker ?? this.element.constructor.workerAddress,
     });
     this.viewer.on("progress", ({ progress }) => {
       this.bar.hidden = progress >= 1;

@@ -111,7 +111,7 @@ function start({ startEditing = () => {}, streaming = null, watchTraining }) {
       navigation.moveTo(parseCamera(text, player.scene), smoothly ? undefined : 0);
       if (smoothly) dismiss();
     } catch ({ message }) {
-      fail({ message: `The camera in the address cannot be used: ${message}.` });
+      report({ message: `The camera in the address cannot be used: ${message}.` });
     }
   };
 
@@ -224,7 +224,7 @@ function start({ startEditing = () => {}, streaming = null, watchTraining }) {
   element("credit").hidden = !isCredited;
   const ready = opener.openFirst(Boolean(embedded), served, parameters);
   ready.catch(report);
-  if (parameters.wrong.length) fail({ message: parameters.wrong.join(" ") });
+  if (parameters.wrong.length) report({ message: parameters.wrong.join(" ") });
 
   // The interface for scripts. Cameras are {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4}, with OpenCV axes;
   // poses are in world units, the rest in pixels.
