@@ -35,7 +35,7 @@ export interface HyrfViewerElement extends HTMLElement {
 export interface HyrfViewerEventMap {
   /** A scene is loaded, for the first time or in a new viewer. */
   load: CustomEvent<string>;
-  /** Something failed; `detail` is a sentence for the user. */
+  /** Something failed, or files of a scene folder are missing; `detail` is a sentence for the user. */
   error: CustomEvent<string>;
   /** `detail` is the part that is loaded, 0 to 1. */
   progress: CustomEvent<number>;

@@ -89,10 +89,11 @@ export interface ViewerEvents {
   /** The part of the scene that is loaded, 0 to 1. */
   progress: { progress: number };
   /**
-   * Something failed. The message is a sentence for the user. `option` is "camera" if the scene is loaded and the first
-   * camera is wrong.
+   * Something failed. The message is a sentence for the user. With `option`, the scene is shown all the same: "camera"
+   * if its first camera is wrong, "src" if files of a scene folder are missing or damaged, or its server no longer
+   * answers.
    */
-  error: { error: Error; option?: "camera" };
+  error: { error: Error; option?: "camera" | "src" };
   /** A frame was drawn from another viewpoint; `viewer.camera` has it. */
   camera: Record<string, never>;
   /** A wheel or a finger was left to the page, see `interaction`. */

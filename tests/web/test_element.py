@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import threading
 import time
+from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -13,6 +14,7 @@ from web.site import GOLDEN_FILE_DATA, Site
 from web.viewer_pages import serve_modules
 
 pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
+SCENE_FOLDER = Path(__file__).parents[1] / "golden" / "scene"
 ELEMENT_JS = "document.querySelector('hyrf-viewer')"
 PAGE = (
     '<!DOCTYPE html><link rel="icon" href="data:,">'
@@ -396,3 +398,21 @@ def test_an_element_in_a_module_of_any_name_has_its_worker_inside(browser: Brows
     browser.open(f"{host.address}/post.html")
     wait_until(browser, "fired.some(([name]) => name === 'load' || name === 'error')")
     assert browser.evaluate(LOADED_JS), browser.evaluate("fired")
+
+
+def test_a_missing_file_of_a_scene_folder_is_an_error_of_the_element_and_its_viewer(browser: Browser, host: Site):
+    files = {f"/scene/{file.name}": file.read_bytes() for file in SCENE_FOLDER.iterdir()}
+    host.files |= {path: data for path, data in files.items() if "chunk" not in path}
+    sentence = "chunk-0000-0.hyrf cannot be shown: it is missing; the rest of the scene is shown."
+    open_element(browser, host)
+    wait_until(browser, LOADED_JS)
+    browser.evaluate(
+        f"fired.length = 0, window.options = [], {ELEMENT_JS}.setAttribute('src', 'scene/scene.json'),"
+        f"{ELEMENT_JS}.viewer.on('error', ({{ option }}) => options.push(option)), 0"
+    )
+    wait_until(browser, LOADED_JS)
+    wait_until(browser, f"fired.some(([name, detail]) => name === 'error' && detail === {sentence!r})")
+    assert browser.evaluate(f"{ELEMENT_JS}.shadowRoot.querySelector('p').textContent") == sentence
+    assert is_shown(browser, "p") and browser.evaluate("options") == ["src"]
+    browser.evaluate(f"{ELEMENT_JS}.viewer.player.emit('problem', ''), 0")  # as when a lost connection is back
+    assert not is_shown(browser, "p")

@@ -160,6 +160,9 @@ export class InlineView {
       this.element.fireEvent("load", "");
     });
     this.viewer.on("error", ({ error, option }) => this.fail(error, option));
+    this.viewer.player.addEventListener("problem", ({ detail }) => {
+      if (!detail) this.hideError("src"); // the connection to the server of a scene folder is back
+    });
     this.watchContext(this.viewer);
     this.viewer.on("ignored", ({ kind }) => this.hint(HINTS[kind]));
   }

@@ -103,6 +103,9 @@ class Viewer {
       }
       this.emit("error", { error: detail });
     });
+    player.addEventListener("problem", ({ detail }) => {
+      if (detail) this.emit("error", { error: new Error(detail), option: "src" });
+    });
     player.addEventListener("moved", () => this.emit("camera", {}));
     player.addEventListener("opened", () => {
       this.navigation.stop();

@@ -4,6 +4,7 @@
 //     "streamed"   detail: {isComplete, gaussians, resident, bytes, totalBytes, psnr, problem} of the view: whether all
 //                  levels that suit it are drawn, the numbers of Gaussians drawn and in memory, the bytes received and
 //                  those of the scene, the predicted PSNR in dB, and a sentence, "" for none
+//     "problem"    detail: that sentence, when it has changed
 
 import { Loader } from "../loader.js";
 import { decodeName } from "../source.js";
@@ -74,7 +75,7 @@ class StreamLoader extends Loader {
     // A content is installed before its parts and levels are handled.
     if (part) this.delivered.then(() => this.addPart(part));
     if (chunk || swap) this.delivered.then(() => this.updateLevels(chunk, swap));
-    if (state) this.setState(state);
+    if (state) this.delivered.then(() => this.setState(state));
   }
 
   // Handles a part whose fields have arrived or are dropped.
@@ -97,11 +98,13 @@ class StreamLoader extends Loader {
   }
 
   setState(state) {
+    if (this.player.loader !== this) return; // meanwhile another scene is shown
     const before = this.state;
     this.state = state;
     if (state.problem !== (before?.problem ?? "")) {
       this.remark = state.problem;
       this.player.emit("remark", state.problem);
+      this.player.emit("problem", state.problem);
     }
     this.player.emit("streamed", state);
   }
