@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from web.scripts import run_script
 
+MAX_POSE_ERROR = 1e-6
+
 
 @pytest.fixture(scope="module")
 def loads() -> dict:
@@ -54,3 +56,7 @@ def test_wrong_arguments_are_refused_by_a_sentence(loads: dict, what: str, words
 
 def test_a_policy_that_requires_trusted_types_is_named(loads: dict):
     assert "requires Trusted Types" in loads["refusal"]
+
+
+def test_setting_the_camera_that_was_read_moves_nothing(loads: dict):
+    assert loads["cameras"]["drift"] < MAX_POSE_ERROR and loads["cameras"]["error"] < MAX_POSE_ERROR

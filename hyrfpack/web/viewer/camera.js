@@ -38,7 +38,14 @@ export function viewOf({ width, height, fx, fy, cx, cy, camera_from_world: pose 
   if (!isRigid(worldRows)) throw new Error("the first three columns of camera_from_world must be a rotation");
   const translation = worldRows.map((row, k) => (dot(row, scene.center) + pose[k][3]) / scene.unit);
   const rows = worldRows.map((row) => rotateBack(axes, row));
-  return { rows, translation, eye: mul(rotateBack(rows, translation), -1), width, height, fx, fy, cx, cy };
+  return { rows, translation, eye: eyeOf(rows, translation), width, height, fx, fy, cx, cy };
+}
+
+// Returns the point that a pose maps to the origin. The rows are inverted, not transposed, because those of rounded
+// poses are not quite orthonormal: `Eye.view` must return the same translation again.
+function eyeOf([right, down, forward], translation) {
+  const columns = [cross(down, forward), cross(forward, right), cross(right, down)];
+  return mul(rotateBack(columns, translation), -1 / dot(right, columns[0]));
 }
 
 // Converts a view to a camera in world units: the inverse of `viewOf`.
