@@ -79,7 +79,7 @@ export interface SceneInfo {
   target: [number, number, number];
   /** Whether `exposure` makes a difference. */
   hasExposureMap: boolean;
-  /** The file's cameras, or a made-up one. */
+  /** Up to 12 cameras of the file, evenly spaced among them, or 12 made-up ones for a file without cameras. */
   cameras: Camera[];
 }
 

@@ -177,6 +177,23 @@ def test_scenes_are_loaded_from(browser: Browser, site: Site, kind: str):
         assert browser.evaluate("src.length") > 0, "the caller's bytes were taken away"
 
 
+def test_the_decoder_reads_merged_files_and_manifests_in_shared_memory(browser: Browser, site: Site):
+    golden = REPOSITORY_ROOT / "tests" / "golden"
+    site.files["/merged.hyrf"] = (golden / "merged" / "v1.4_merged.hyrf").read_bytes()
+    site.files["/scene.json"] = (golden / "scene" / "scene.json").read_bytes()
+    open_viewer(browser, site, SHARE_BYTES_JS)
+    browser.evaluate(
+        "(async () => { const { readParts } = await import('/hyrf/index.js');"
+        " const { parseManifest } = await import('/hyrf/manifest.js');"
+        " const load = async (name) => shareBytes(new Uint8Array(await (await fetch(name)).arrayBuffer()));"
+        " window.counts = [(await readParts(await load('merged.hyrf'))).length,"
+        " parseManifest(await load('scene.json')).gaussians]; })()"
+    )
+    merged = hyrfpack.load_merged_model(golden / "merged" / "v1.4_merged.hyrf")
+    manifest = hyrfpack.SceneFolder(golden / "scene").manifest
+    assert browser.evaluate("counts") == [len(merged.parts), manifest.gaussians]
+
+
 @pytest.mark.parametrize(
     ("source", "words"),
     [

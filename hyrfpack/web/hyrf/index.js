@@ -234,7 +234,8 @@ const sourceOf = (container, type) => {
   if (!container.has(type)) rejectIncomplete(container, requireEntry(container, type).end);
   if (container.shared) return container.shared;
   const name = sharedFileName(container);
-  throw new HyrfFormatError(`The file needs ${name}; open scene.json of its folder.`);
+  const fix = "open the folder's scene.json in a player, or give `read` the option openFile";
+  throw new HyrfFormatError(`The file needs ${name} of its scene folder; ${fix}.`);
 };
 
 /**

@@ -72,8 +72,9 @@ export const parseManifest = (bytes) => {
  * @returns {any}
  */
 const parseText = (bytes) => {
+  const plain = bytes.slice(); // TextDecoder does not accept shared memory
   try {
-    return JSON.parse(new TextDecoder("utf-8", { fatal: true, ignoreBOM: true }).decode(bytes));
+    return JSON.parse(new TextDecoder("utf-8", { fatal: true, ignoreBOM: true }).decode(plain));
   } catch {
     throw new DamagedData("it is not JSON");
   }

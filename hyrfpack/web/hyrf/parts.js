@@ -25,7 +25,8 @@ export const readPartNames = (container) => {
   let content = null;
   try {
     const decoder = new TextDecoder("utf-8", { fatal: true, ignoreBOM: true });
-    content = JSON.parse(decoder.decode(container.stored(PART_NAMES_TYPE)));
+    // TextDecoder does not accept shared memory, so the bytes are copied.
+    content = JSON.parse(decoder.decode(container.stored(PART_NAMES_TYPE).slice()));
   } catch (error) {
     if (error instanceof HyrfFormatError) throw error;
     rejectDamaged("the names of its parts are not JSON");

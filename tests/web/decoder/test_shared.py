@@ -154,4 +154,5 @@ def test_the_bytes_of_a_chunk_alone_are_refused_with_the_way_to_open_it():
 
     (verdict,) = read_in_javascript([(chunk, False)])
 
-    assert verdict.refused.endswith("needs shared.hyrf; open scene.json of its folder.")
+    assert "needs shared.hyrf of its scene folder; open the folder's scene.json in a player" in verdict.refused
+    assert verdict.refused.endswith("give `read` the option openFile.")
