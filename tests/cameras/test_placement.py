@@ -11,27 +11,27 @@ from scenes import ball_scene
 
 from hyrfpack.cameras.placement import Placement
 
-TURN = Placement.rotation_about_axis((0.3, -1.0, 0.4), 130).rotation
-STEP = Placement(2.5, TURN, np.array([3.0, -2.0, 0.5]))
+TURN_MATRIX = Placement.rotation_about_axis((0.3, -1.0, 0.4), 130).rotation
+TEST_PLACEMENT = Placement(2.5, TURN_MATRIX, np.array([3.0, -2.0, 0.5]))
 
 
 def test_a_moved_scene_shows_its_points_at_the_same_pixels():
     scene = ball_scene(points=20)
-    moved = STEP.move_scene(scene)
+    moved = TEST_PLACEMENT.move_scene(scene)
     assert moved.train[0].name == scene.train[0].name and len(moved.test) == len(scene.test)
     for before, after in zip(scene.views, moved.views, strict=True):
         local, moved_local = (
             points @ view.camera.camera_from_world[:3, :3].T + view.camera.camera_from_world[:3, 3]
             for view, points in ((before, scene.points), (after, moved.points))
         )
-        assert_allclose(moved_local, STEP.factor * local, atol=1e-9)
+        assert_allclose(moved_local, TEST_PLACEMENT.factor * local, atol=1e-9)
 
 
 def test_stored_placements_are_read_back_to_nine_digits():
-    read = Placement.from_json(json.loads(json.dumps(STEP.to_json())))
-    assert read.factor == STEP.factor
-    assert_allclose(read.rotation, STEP.rotation, atol=1e-8)
-    assert_allclose(read.offset, STEP.offset, rtol=1e-8)
+    read = Placement.from_json(json.loads(json.dumps(TEST_PLACEMENT.to_json())))
+    assert read.factor == TEST_PLACEMENT.factor
+    assert_allclose(read.rotation, TEST_PLACEMENT.rotation, atol=1e-8)
+    assert_allclose(read.offset, TEST_PLACEMENT.offset, rtol=1e-8)
     assert Placement.from_json(Placement().to_json()).is_identity
 
 
@@ -50,4 +50,4 @@ def test_stored_placements_are_read_back_to_nine_digits():
 )
 def test_invalid_placements_are_refused(change):
     with pytest.raises((TypeError, ValueError)):
-        Placement.from_json({**STEP.to_json(), **change})
+        Placement.from_json({**TEST_PLACEMENT.to_json(), **change})

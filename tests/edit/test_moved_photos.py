@@ -22,13 +22,12 @@ from hyrfpack.format.codec import load_with_provenance
 from tools.safety.train_golden import DEMO_MODEL_FILE
 
 pytestmark = pytest.mark.usefixtures("quick_calibration")
-MOVES = [Scale(2.5), Rotate((0.3, -1.0, 0.4), 130.0), Translate((3.0, -2.0, 0.5))]
-MOVE_OPTIONS = ("--scale", "2.5", "--rotate", "0.3,-1,0.4,130", "--translate", "3,-2,0.5")
+TEST_MOVES = [Scale(2.5), Rotate((0.3, -1.0, 0.4), 130.0), Translate((3.0, -2.0, 0.5))]
 
 
 @pytest.fixture
 def moved(tmp_path: Path) -> Path:
-    edit_model(DEMO_MODEL_FILE, tmp_path / "moved.hyrf", MOVES, context=QUIET_CONTEXT)
+    edit_model(DEMO_MODEL_FILE, tmp_path / "moved.hyrf", TEST_MOVES, context=QUIET_CONTEXT)
     return tmp_path / "moved.hyrf"
 
 
@@ -77,7 +76,7 @@ def test_compressing_a_moved_model_with_photos_gives_the_numbers_of_one_that_was
 
 
 def test_a_moved_model_can_be_edited_exported_and_split_with_its_photos(moved, photos, scene, tmp_path):
-    report = edit_model(moved, tmp_path / "cleaned.hyrf", [MinOpacity(0.01), *MOVES], data=scene, context=QUIET_CONTEXT)
+    report = edit_model(moved, tmp_path / "cleaned.hyrf", [MinOpacity(0.01), *TEST_MOVES], data=scene, context=QUIET_CONTEXT)
     assert report.psnr_after == pytest.approx(report.psnr_before, abs=0.3)
     succeeded("split", moved, "-o", tmp_path / "split", "--data", photos, "--levels", "1")
     succeeded("export", moved, "-o", tmp_path / "cameras.json", "--data", photos)
@@ -91,7 +90,7 @@ def test_a_part_that_was_moved_while_merging_keeps_its_photos(scene, tmp_path):
     merge_models(
         [DEMO_MODEL_FILE, DEMO_MODEL_FILE.with_name("demo_compact.hyrf")],
         tmp_path / "merged.hyrf",
-        moves={DEMO_MODEL_FILE.stem: MOVES},
+        moves={DEMO_MODEL_FILE.stem: TEST_MOVES},
     )
     facts = describe_file(tmp_path / "merged.hyrf")
     assert Capture(facts, place_photos(facts, scene)).mismatch == "" != Capture(facts, scene).mismatch
