@@ -76,7 +76,9 @@ def test_compressing_a_moved_model_with_photos_gives_the_numbers_of_one_that_was
 
 
 def test_a_moved_model_can_be_edited_exported_and_split_with_its_photos(moved, photos, scene, tmp_path):
-    report = edit_model(moved, tmp_path / "cleaned.hyrf", [MinOpacity(0.01), *TEST_MOVES], data=scene, context=QUIET_CONTEXT)
+    report = edit_model(
+        moved, tmp_path / "cleaned.hyrf", [MinOpacity(0.01), *TEST_MOVES], data=scene, context=QUIET_CONTEXT
+    )
     assert report.psnr_after == pytest.approx(report.psnr_before, abs=0.3)
     succeeded("split", moved, "-o", tmp_path / "split", "--data", photos, "--levels", "1")
     succeeded("export", moved, "-o", tmp_path / "cameras.json", "--data", photos)
