@@ -204,13 +204,13 @@ class Capture:
         if self.scene is None:
             return ""
         differences = self._differences_of_stored_cameras()
-        found = int((differences <= 1).sum())
-        if found >= _MIN_MATCHED_CAMERA_SHARE * len(differences):
+        matched = int((differences <= 1).sum())
+        if matched >= _MIN_MATCHED_CAMERA_SHARE * len(differences):
             return ""
         return (
             f"{self.scene.path}: of the {len(differences)} cameras that the model keeps of its training, "
-            f"{found or 'none'} "
-            f"{'are' if found > 1 else 'is'} among those of these photos, which may show another scene or have poses "
+            f"{matched or 'none'} "
+            f"{'are' if matched > 1 else 'is'} among those of these photos, which may show another scene or have poses "
             "in another coordinate frame"
         )
 

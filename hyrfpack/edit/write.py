@@ -151,4 +151,4 @@ def _unchanged_photos(edit: Edit, data: Scene) -> Scene:
             "the edit changes every pixel of the held-out photos, so no loss of PSNR can be measured there",
             fix="use `target_bytes` instead of `max_psnr_drop`",
         )
-    return replace(data, train=[edit.after.placement.move_view(view) for view in data.train], test=held_out)
+    return replace(edit.after.placement.move_scene(data), test=held_out)
