@@ -39,6 +39,7 @@ LAYER_BY_PATH = {
     "evaluate": "unit",
     "format": "unit",
     "fuzz": "unit",
+    "independent/test_gsply.py": "acceptance",
     "measure": "unit",
     "model": "unit",
     "ops": "unit",

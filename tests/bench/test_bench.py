@@ -70,6 +70,7 @@ def test_every_setting_has_one_reference_without_error_and_one_default(measure):
         assert all(row.time.ms > 0 and row.time.repeats == 1 for row in values.values())
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_rasterize_errors_are_against_float64_with_the_same_antialiasing(antialiased):
     model = make_model()

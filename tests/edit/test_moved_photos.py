@@ -66,6 +66,7 @@ def test_an_invalid_placement_is_ignored_and_left_out_of_the_next_file(stored, s
     assert PLACEMENT_KEY not in describe_file(tmp_path / "next.hyrf")["provenance"]
 
 
+@pytest.mark.acceptance
 def test_compressing_a_moved_model_with_photos_gives_the_numbers_of_one_that_was_not_moved(moved, scene, tmp_path):
     config = hyrfpack.CompressConfig(max_psnr_drop=0.5)
     files = {

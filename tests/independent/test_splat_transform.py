@@ -63,6 +63,7 @@ def written_folder(node, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize("name", WRITTEN_FILES)
 def test_we_read_what_splat_transform_writes(name, written_folder):
     degree, _, precision = WRITTEN_FILES[name]
@@ -70,6 +71,7 @@ def test_we_read_what_splat_transform_writes(name, written_folder):
     assert compare_clouds(cloud_from_splats(sample_splats(degree)), cloud_from_splats(ours)).is_within(precision)
 
 
+@pytest.mark.acceptance
 def test_we_read_a_glb_of_splat_transform_in_its_own_axes(written_folder, node):
     glb = written_folder / "turned.glb"
     convert_files(node, [(written_folder / "3.ply", glb)])

@@ -98,6 +98,7 @@ def test_the_manifest_has_a_shared_file_for_each_part_and_matches_the_schema(fol
     assert matches(values, MANIFEST_SCHEMA)
 
 
+@pytest.mark.acceptance
 def test_the_finest_levels_are_drawn_as_the_merged_file(folder, merged_file, cameras):
     merged, scene = load_merged_model(merged_file), SceneFolder(folder).load()
 
