@@ -40,6 +40,18 @@ export const rejectNewer = (what) => {
 };
 
 /**
+ * Returns bytes that a caller passes. A Uint8Array of another frame is accepted, whose class is another one.
+ * @param {Uint8Array} value
+ * @param {string} what the name of the file
+ * @throws {TypeError} it is no Uint8Array
+ */
+export const requireBytes = (value, what) => {
+  const type = Object.prototype.toString.call(value).slice(8, -1);
+  if (type === "Uint8Array") return value;
+  throw new TypeError(`${what} must be a Uint8Array, not ${type}; pass new Uint8Array(await response.arrayBuffer()).`);
+};
+
+/**
  * Throws DamagedData unless a condition holds.
  * @param {boolean} holds whether the condition holds
  * @param {string} what the reason

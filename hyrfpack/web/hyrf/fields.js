@@ -27,7 +27,7 @@ const OUTPUTS_PER_GROUP = 8;
  *   places: Float64Array, radii: Float64Array, features: Float64Array, encoded: Float64Array,
  *   hidden: Float64Array, hidden2: Float64Array, outputs: Float64Array}} PreparedField
  *
- * @typedef {import("./index.js").Model} Model
+ * @typedef {import("./reader.js").Model} Model
  * @typedef {import("./grids.js").FieldName} FieldName
  */
 

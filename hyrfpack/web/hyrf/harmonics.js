@@ -45,7 +45,7 @@ const COARSE_TIME_RATIO = 0.1; // the measured share of the time until the coars
  * @typedef {{place: number[], rows: number[][], translation: number[], bounds: number[], focal: number, area: number}}
  *   LocalCamera
  *
- * @typedef {import("./index.js").Model} Model
+ * @typedef {import("./reader.js").Model} Model
  */
 
 /**
@@ -66,8 +66,10 @@ const COARSE_TIME_RATIO = 0.1; // the measured share of the time until the coars
  *   `report` throws ends the conversion.
  * @returns {Promise<Splats>}
  * @throws {HyrfFormatError} a shape or a colour is NaN or infinite
+ * @throws {RangeError} `degree` is not 0, 1, 2 or 3
  */
 export async function fitHarmonics(model, viewpoints, degree, report = () => {}) {
+  if (![0, 1, 2, 3].includes(degree)) throw new RangeError(`degree must be 0 to 3, not ${degree}.`);
   const { count, config } = model, { center, scale, rotation } = config.frame;
   const higher = HIGHER_HARMONICS_BY_DEGREE[degree];
   /** @type {Splats} */

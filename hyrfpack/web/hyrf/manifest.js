@@ -2,7 +2,7 @@
 // it is checked.
 
 import { MAX_PARTS } from "./container.js";
-import { DamagedData, HyrfFormatError, assertValid, groupedDigits, quotedText } from "./errors.js";
+import { DamagedData, HyrfFormatError, assertValid, groupedDigits, quotedText, requireBytes } from "./errors.js";
 import { MAX_NESTING_DEPTH } from "./json.js";
 import { MAX_QUAT_LENGTH_ERROR } from "./metadata.js";
 import { CONTROL_CHARACTERS, arePartNames } from "./parts.js";
@@ -48,8 +48,10 @@ const MAX_FILE_BYTES = 2 ** 34;
  * @param {Uint8Array} bytes
  * @returns {Manifest}
  * @throws {HyrfFormatError} it is no manifest, is damaged, or has another major version
+ * @throws {TypeError} `bytes` is no Uint8Array
  */
 export const parseManifest = (bytes) => {
+  requireBytes(bytes, "The manifest");
   try {
     assertValid(bytes.length <= MAX_MANIFEST_BYTES, `it has ${groupedDigits(bytes.length)} bytes`);
     const values = parseText(bytes);

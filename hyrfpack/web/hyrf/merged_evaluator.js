@@ -19,7 +19,7 @@ import { FLOATS_PER_SHAPE, GAUSSIANS_PER_ROW, ViewEvaluator } from "./view_evalu
  */
 
 export class MergedEvaluator {
-  /** @param {import("./index.js").Model[]} models */
+  /** @param {import("./reader.js").Model[]} models */
   constructor(models) {
     /** The number of rows. */
     this.rowCount = 0;

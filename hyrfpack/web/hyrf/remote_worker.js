@@ -14,7 +14,7 @@
 
 import { HEADER_BYTES, MAGIC_BYTES, readUint64 } from "./container.js";
 import { HyrfError, HyrfFormatError, explainMemory, groupedDigits } from "./errors.js";
-import { readParts } from "./index.js";
+import { readFileParts } from "./reader.js";
 import { MergedEvaluator } from "./merged_evaluator.js";
 
 const PROGRESS_INTERVAL_MS = 50;
@@ -69,7 +69,7 @@ function report(work) {
 async function open({ address, bytes = new Uint8Array(0) }) {
   const data = address === undefined ? bytes : await fetchBytes(address);
   post({ progress: { step: "decoding", part: 0 } });
-  const models = (await readParts(data)).map(({ model }) => model);
+  const models = (await readFileParts(data)).map(({ model }) => model);
   evaluator = new MergedEvaluator(models);
   const { metadata, config, exposure } = models[0], count = models.reduce((sum, model) => sum + model.count, 0);
   const parts = evaluator.parts.map(({ place, firstRow, rowCount }, number) => {

@@ -20,7 +20,7 @@ const COARSE_SKY_HEIGHT_PIXELS = 64;
 const TILE_WIDTH_PIXELS = 64, TILE_HEIGHT_PIXELS = 32;
 
 /**
- * @typedef {import("./index.js").Model} Model
+ * @typedef {import("./reader.js").Model} Model
  * @typedef {import("./frustum.js").View} View
  *
  * A row of Gaussians, of which the first has the index GAUSSIANS_PER_ROW times `row`. `shapes` has FLOATS_PER_SHAPE

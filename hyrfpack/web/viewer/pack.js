@@ -78,7 +78,7 @@ function packEstimate(model, eye, pixelSizes) {
   return { places, shapes, colors: packed };
 }
 
-// Packs a model that hyrf/index.js has read for fields.js. `eye` is the first viewpoint in local units.
+// Packs a model that hyrf/reader.js has read for fields.js. `eye` is the first viewpoint in local units.
 export function packModel(model, eye) {
   const { count } = model, gaussians = packGaussians(model, TEXTURE_WIDTH);
   const estimate = packEstimate(model, eye, gaussians.pixelSizes);

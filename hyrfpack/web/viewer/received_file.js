@@ -1,7 +1,7 @@
 // Collects the bytes of a file while they arrive, and identifies its format from the first of them.
 
 import { ENTRY_BYTES, HEADER_BYTES, MAGIC_BYTES, MAX_SECTIONS, PART_NAMES_TYPE } from "../hyrf/container.js";
-import { describe } from "../hyrf/index.js";
+import { describeFile } from "../hyrf/reader.js";
 
 const MAX_FIRST_LAYER_RATIO = 0.8; // a first layer that is a larger part of its file is not decoded alone
 const MAX_UNSIZED_FILE_BYTES = 2 ** 32; // the limit for formats whose header does not give the file's length
@@ -68,7 +68,7 @@ export class ReceivedFile {
     if (length < HEADER_BYTES) return;
     const sections = new DataView(firstBytes.buffer).getUint32(SECTION_COUNT_OFFSET, true);
     if (sections <= MAX_SECTIONS && length < HEADER_BYTES + ENTRY_BYTES * sections) return;
-    const description = describe(available);
+    const description = describeFile(available);
     this.maxLength = description.length;
     this.isMerged = description.sections.some(({ type }) => type === PART_NAMES_TYPE);
     if (this.layered && description.firstLayer < MAX_FIRST_LAYER_RATIO * description.length) {
@@ -79,7 +79,7 @@ export class ReceivedFile {
 
   // Throws the error for a file that is too long.
   rejectLength() {
-    if (!this.isOtherFormat) describe(this.gather()); // throws an error about the length
+    if (!this.isOtherFormat) describeFile(this.gather()); // throws an error about the length
     throw new Error("It is larger than 4 GiB; open a smaller one.");
   }
 }

@@ -1,12 +1,12 @@
 // Finds the Gaussians that the actions of an edit keep, in the worker.
 
-import { read } from "../hyrf/index.js";
+import { readFile } from "../hyrf/reader.js";
 import { decodeGeometry } from "../hyrf/fields.js";
 
 // Returns the opacities of a model's Gaussians, and the lengths of their longest axes in local units. `bytes` are those
 // of its file.
 export async function measureGaussians(bytes) {
-  const model = await read(bytes), { count } = model, { opacities, scales } = decodeGeometry(model, 0, count);
+  const model = await readFile(bytes), { count } = model, { opacities, scales } = decodeGeometry(model, 0, count);
   const lengths = Float32Array.from({ length: count }, (_, i) => Math.max(...scales.subarray(3 * i, 3 * i + 3)));
   return { opacities, lengths };
 }

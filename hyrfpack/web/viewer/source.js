@@ -4,8 +4,8 @@
 
 const FROM_DISK_TEXT = "a page opened from the disk may not read files; serve both, or drop the file on a player";
 // A sandbox without allow-same-origin makes every server, even the page's own, another site.
-const OPAQUE_FRAME_TEXT = "the sandbox of the frame around this page forbids it; add allow-same-origin to the " +
-  "sandbox, or let the file's server send Access-Control-Allow-Origin: *";
+const OPAQUE_FRAME_TEXT = "the sandbox of this page's frame forbids it; add allow-same-origin, or let the file's " +
+  "server send Access-Control-Allow-Origin: *";
 
 const UNNAMED_FILE = "the scene";
 

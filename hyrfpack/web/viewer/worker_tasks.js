@@ -25,7 +25,7 @@
 
 import { explainMemory } from "../hyrf/errors.js";
 import { fitHarmonics } from "../hyrf/harmonics.js";
-import { read, readParts } from "../hyrf/index.js";
+import { readFile, readFileParts } from "../hyrf/reader.js";
 import { toLocalView, viewpointOf } from "../hyrf/viewpoint.js";
 import { TEXTURE_WIDTH } from "./constants.js";
 import { rejectOtherFiles } from "./other_files.js";
@@ -88,7 +88,7 @@ class Service {
   async answer({ ticket, select, decode }) {
     try {
       const bytes = this.reader.file.gather(), { kept } = this.sorter;
-      const value = select ? await this.select(select) : decode ? { model: await read(bytes), kept } : bytes;
+      const value = select ? await this.select(select) : decode ? { model: await readFile(bytes), kept } : bytes;
       this.post({ answer: { ticket, value } });
     } catch (error) {
       this.post({ answer: { ticket, error: explainMemory(error).message } });
@@ -172,9 +172,9 @@ class SceneReader {
     this.reportProgress("unpacking", 0);
     let positions;
     if (file.isMerged) {
-      positions = this.decodeMerged(await readParts(bytes), content);
+      positions = this.decodeMerged(await readFileParts(bytes), content);
     } else if (file.isModel) {
-      const model = await read(bytes, { partial });
+      const model = await readFile(bytes, { partial });
       content.scene = { ...(scene ?? { ...modelScene(model, name), ...stage }), exposure: model.exposure };
       positions = model.positions;
       if (plain) {

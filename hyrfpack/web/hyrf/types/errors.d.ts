@@ -24,6 +24,13 @@ export declare const rejectDamaged: (what: string) => never;
  */
 export declare const rejectNewer: (what: string) => never;
 /**
+ * Returns bytes that a caller passes. A Uint8Array of another frame is accepted, whose class is another one.
+ * @param {Uint8Array} value
+ * @param {string} what the name of the file
+ * @throws {TypeError} it is no Uint8Array
+ */
+export declare const requireBytes: (value: Uint8Array, what: string) => Uint8Array<ArrayBufferLike>;
+/**
  * Throws DamagedData unless a condition holds.
  * @param {boolean} holds whether the condition holds
  * @param {string} what the reason

@@ -24,7 +24,7 @@ export type PreparedField = {
     hidden2: Float64Array;
     outputs: Float64Array;
 };
-export type Model = import("./index.js").Model;
+export type Model = import("./reader.js").Model;
 export type FieldName = import("./grids.js").FieldName;
 /**
  * Evaluates the geometry field: opacities, scales and rotations of Gaussians `start` to `stop`.

@@ -23,7 +23,7 @@ export type LocalCamera = {
     focal: number;
     area: number;
 };
-export type Model = import("./index.js").Model;
+export type Model = import("./reader.js").Model;
 /**
  * Explicit splats in local axes. The world position of a point p is `center` + `unit` R p, with the rotation R of the
  * quaternion `rotation` (wxyz; absent: the axes are the world's). The colour along the unit vector d is max(0, `colors`
@@ -50,7 +50,7 @@ export type Model = import("./index.js").Model;
  * @typedef {{place: number[], rows: number[][], translation: number[], bounds: number[], focal: number, area: number}}
  *   LocalCamera
  *
- * @typedef {import("./index.js").Model} Model
+ * @typedef {import("./reader.js").Model} Model
  */
 /**
  * Converts a model to splats with the model's shapes and opacities. The harmonics h of each Gaussian minimise, over the
@@ -70,6 +70,7 @@ export type Model = import("./index.js").Model;
  *   `report` throws ends the conversion.
  * @returns {Promise<Splats>}
  * @throws {HyrfFormatError} a shape or a colour is NaN or infinite
+ * @throws {RangeError} `degree` is not 0, 1, 2 or 3
  */
 export declare function fitHarmonics(model: Model, viewpoints: import("./viewpoint.js").Camera[], degree: number, report?: (progress: {
     done: number;

@@ -1,57 +1,22 @@
 import { HyrfError, HyrfFormatError } from "./errors.js";
 export { HyrfError, HyrfFormatError };
-export type Entry = import("./container.js").Entry;
-export type ExposureMap = import("./exposure.js").ExposureMap;
-export type FieldName = import("./grids.js").FieldName;
-export type LatticePoints = import("./lattice.js").LatticePoints;
-export type Config = import("./metadata.js").Config;
-export type Metadata = import("./metadata.js").Metadata;
-export type Field = {
-    table: Float32Array;
-    decoder: Float32Array;
-};
-export type Model = {
-    metadata: Metadata;
-    config: Config;
-    count: number;
-    layers: number[];
-    whole: boolean;
-    positions: Float32Array;
-    colorLogits: Float32Array;
-    scaleLogits: Float32Array;
-    opacityLogits: Float32Array;
-    shapeResiduals: Float32Array | null;
-    colorResiduals: Float32Array | null;
-    geometry: Field;
-    radiance: Field;
-    exposure: ExposureMap | null;
-};
-export type Description = {
-    version: [number, number];
-    length: number;
-    sections: {
-        type: string;
-        codec: number;
-        offset: number;
-        stored: number;
-        raw: number;
-    }[];
-    firstLayer: number;
-};
-export type OpenFile = (name: string) => Uint8Array | Promise<Uint8Array>;
-export type ExpectedSection = {
-    type: string;
-    group: string;
-    layer: number;
-    rows: number;
-    columns: number;
-};
+export type Description = import("./reader.js").Description;
+export type Field = import("./reader.js").Field;
+export type Model = import("./reader.js").Model;
+export type OpenFile = import("./reader.js").OpenFile;
+/**
+ * @typedef {import("./reader.js").Description} Description
+ * @typedef {import("./reader.js").Field} Field
+ * @typedef {import("./reader.js").Model} Model
+ * @typedef {import("./reader.js").OpenFile} OpenFile
+ */
 /**
  * Describes a file by its header and its table of contents.
  * @param {Uint8Array} bytes the start of a file, or all of it
  * @returns {Description} all lengths in bytes; a model of the first layer needs the first `firstLayer` bytes. A merged
  *   file is needed whole
  * @throws {HyrfFormatError} the header or the table of contents is invalid
+ * @throws {TypeError} `bytes` is no Uint8Array
  */
 export declare const describe: (bytes: Uint8Array) => Description;
 /**
@@ -62,6 +27,7 @@ export declare const describe: (bytes: Uint8Array) => Description;
  * @returns {Promise<Model>} the fields and the exposure map of a chunk are those of the other file
  * @throws {HyrfFormatError} the file is damaged, truncated or too new; `bytes` has no complete layer; the file is a
  *   merged one; or it refers to a file that is damaged or another one, or that cannot be opened, as without `openFile`
+ * @throws {TypeError} `bytes`, or what `openFile` returns, is no Uint8Array
  */
 export declare const read: (bytes: Uint8Array, { partial, openFile }?: {
     partial?: boolean;
@@ -73,6 +39,7 @@ export declare const read: (bytes: Uint8Array, { partial, openFile }?: {
  * @param {Uint8Array} bytes the whole file
  * @returns {Promise<{name: string, model: Model}[]>}
  * @throws {HyrfFormatError} the file is damaged, truncated or too new
+ * @throws {TypeError} `bytes` is no Uint8Array
  */
 export declare const readParts: (bytes: Uint8Array) => Promise<{
     name: string;

@@ -36,6 +36,7 @@ export declare const MAX_MANIFEST_BYTES: number;
  * @param {Uint8Array} bytes
  * @returns {Manifest}
  * @throws {HyrfFormatError} it is no manifest, is damaged, or has another major version
+ * @throws {TypeError} `bytes` is no Uint8Array
  */
 export declare const parseManifest: (bytes: Uint8Array) => Manifest;
 /**

@@ -4,7 +4,7 @@ export declare const GAUSSIANS_PER_ROW = 2048;
 /** The number of floats that describe the shape of a Gaussian: its position and three axes. */
 export declare const FLOATS_PER_SHAPE = 12;
 export declare const FLOATS_PER_COLOR = 4;
-export type Model = import("./index.js").Model;
+export type Model = import("./reader.js").Model;
 export type View = import("./frustum.js").View;
 export type EvaluatedRow = {
     row: number;
@@ -27,7 +27,7 @@ export type SkySize = {
     coarseHeight: number;
 };
 /**
- * @typedef {import("./index.js").Model} Model
+ * @typedef {import("./reader.js").Model} Model
  * @typedef {import("./frustum.js").View} View
  *
  * A row of Gaussians, of which the first has the index GAUSSIANS_PER_ROW times `row`. `shapes` has FLOATS_PER_SHAPE
@@ -53,7 +53,7 @@ export type SkySize = {
  */
 export declare function skySize(metadata: import("./metadata.js").Metadata): SkySize | null;
 export declare class ViewEvaluator {
-    model: import("./index.js").Model;
+    model: import("./reader.js").Model;
     rows: RowStates;
     pixelSizes: Float32Array<ArrayBufferLike>;
     opacities: Float32Array<ArrayBuffer>;

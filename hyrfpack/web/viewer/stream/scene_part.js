@@ -1,7 +1,7 @@
 // One part of a streamed scene, in the worker: its shared file, and where it lies in the scene.
 
 import { HyrfFormatError } from "../../hyrf/errors.js";
-import { read } from "../../hyrf/index.js";
+import { readFile } from "../../hyrf/reader.js";
 import { IDENTITY_PLACE, placeOf } from "../../hyrf/places.js";
 import { packFields } from "../pack.js";
 
@@ -25,7 +25,7 @@ export class ScenePart {
 
   // Takes the bytes of its shared file. `scene` is the first part.
   async receive(bytes, scene) {
-    const model = await read(bytes);
+    const model = await readFile(bytes);
     if (model.count) throw new HyrfFormatError("it holds Gaussians, and should hold only what chunks share");
     if (this !== scene) {
       if (model.config.antialiased !== scene.config.antialiased) {
@@ -44,7 +44,7 @@ export class ScenePart {
 
   // Reads a chunk of the part. `file` is its entry in the manifest.
   async readChunk(file, bytes) {
-    const model = await read(bytes, { openFile: (name) => this.openFile(name) });
+    const model = await readFile(bytes, { openFile: (name) => this.openFile(name) });
     if (model.count !== file.gaussians) {
       throw new HyrfFormatError(`it has ${model.count} Gaussians, and the manifest says ${file.gaussians}`);
     }
@@ -62,7 +62,7 @@ export class ScenePart {
 
   // Returns what the page needs of the part, and its `source`, which is not sent.
   async pack() {
-    const { number, place, exposure } = this, source = this.source ?? (await read(this.bytes));
+    const { number, place, exposure } = this, source = this.source ?? (await readFile(this.bytes));
     const model = packFields(source);
     this.source = null; // its tables are transferred
     return { source, packed: { part: number, model, place, exposure } };
