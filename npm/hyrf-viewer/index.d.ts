@@ -39,7 +39,7 @@ export interface ViewerOptions {
   src?: Source | null;
   /** File name of the first scene if `src` has none. Endings tell formats of splats apart. */
   name?: string;
-  /** The first camera of the first scene. */
+  /** The first camera of the first scene; later loads do not use it, even if the first one fails. */
   camera?: CameraName | null;
   exposure?: Exposure;
   /** Turn slowly while the user makes no input, unless the user prefers reduced motion. */

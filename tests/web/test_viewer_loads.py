@@ -38,6 +38,10 @@ def test_an_error_of_a_listener_is_reported_and_changes_nothing_else(loads: dict
     assert loads["listeners"]["loadError"].startswith("A scene is an address")
 
 
+def test_the_first_camera_is_used_by_the_first_load_only(loads: dict):
+    assert loads["firstCameras"] == [[], [5]]
+
+
 @pytest.mark.parametrize(
     ("what", "words"),
     [

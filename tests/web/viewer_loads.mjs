@@ -7,6 +7,8 @@
 //     `streams`: the same for the streams of an application, of which nothing was read and of which a part was read
 //     `kept`: the lengths of the arrays of an application after its stream was loaded
 //     `listeners`: which listeners of an error were called, the errors that the page reports, and that of the load
+//     `firstCameras`: the cameras to which a viewer with the option `camera` moves when a scene is opened: that of a load
+//         after the first one has failed, and that of the first load
 //     `wrong`: the errors of arguments that are not valid
 //     `refusal`: the error of a page on which only trusted types may start a worker
 //     `cameras`: how far 1,000 rounds of reading and setting the camera move it (`drift`), and how far a camera that was
@@ -126,6 +128,23 @@ viewer.on("error", () => {
 viewer.on("error", () => called.push("second"));
 const loadError = await viewer.load(42).catch(({ message }) => message);
 result.listeners = { called: [...called], reported: [...reported], loadError };
+
+// Opens a file in a viewer whose player shows it at once. Returns the cameras to which the viewer moves.
+async function openAt(viewer) {
+  const moves = [], { player } = viewer;
+  viewer.moveTo = (camera) => moves.push(camera);
+  player.open = async ({ origin }) => {
+    player.loader = { origin };
+    player.emit("opened");
+  };
+  await viewer.load(new Blob(["scene"]));
+  return moves;
+}
+const openWith = (options) => createViewer({ container: new FakeElement(), renderer: FakeRenderer, ...options });
+globalThis.fetch = async () => new Response("", { status: 404 });
+const failed = openWith({ src: "http://host/gone.hyrf", camera: 5 });
+await wait();
+result.firstCameras = [await openAt(failed), await openAt(openWith({ camera: 5 }))];
 
 const texts = new ReadableStream({ start: (controller) => controller.enqueue("text") });
 const locked = new ReadableStream();

@@ -59,7 +59,9 @@ class HyrfViewerElement extends (globalThis.HTMLElement ?? class {}) {
     this.schedule();
   }
 
-  attributeChangedCallback() {
+  // An address that is set again starts another load if the last one has failed.
+  attributeChangedCallback(name) {
+    if (name === "src") this.view?.forgetFailedLoad();
     this.schedule();
   }
 

@@ -18,6 +18,7 @@ export class FrameView {
     this.frame = null;
     this.address = "";
     this.isMoved = false;
+    this.isLoadFailed = false; // whether the player's last message was an error, or there was none
     this.receiveMessage = this.receiveMessage.bind(this);
     addEventListener("message", this.receiveMessage);
   }
@@ -75,7 +76,7 @@ export class FrameView {
     }
     this.removeFrame();
     this.address = href;
-    this.isAnswered = this.isLoaded = false;
+    this.isAnswered = this.isLoaded = this.isLoadFailed = false;
     this.frame = document.createElement("iframe");
     this.frame.allow = "fullscreen; clipboard-write; web-share";
     this.frame.loading = this.loading; // before it has an address
@@ -84,7 +85,7 @@ export class FrameView {
       this.isLoaded = true;
       if (this.isMoved && this.frame.src !== this.address) this.replaceAddress(); // with that of the newest camera
       this.isMoved = false;
-      if (!this.isAnswered) this.timer = setTimeout(() => this.fail(this.noPlayerText()), ANSWER_MS);
+      if (!this.isAnswered) this.timer = setTimeout(() => this.refuse(), ANSWER_MS);
     };
     this.element.shadowRoot.append(this.frame);
   }
@@ -105,9 +106,16 @@ export class FrameView {
     this.address = "";
   }
 
-  noPlayerText() {
+  // Reports that the frame has no player.
+  refuse() {
+    this.isLoadFailed = true;
     const address = this.address.split(/[?#]/)[0];
-    return `${address} is no player, or is not allowed to run here; ${FIX_TEXT}`;
+    this.fail(`${address} is no player, or is not allowed to run here; ${FIX_TEXT}`);
+  }
+
+  // Makes the next update load the scene again if its load has failed.
+  forgetFailedLoad() {
+    if (this.isLoadFailed) this.removeFrame();
   }
 
   // Passes on the events of the player in the frame.
@@ -115,7 +123,9 @@ export class FrameView {
     if (source !== this.frame?.contentWindow || !data?.hyrf) return;
     this.isAnswered = true;
     clearTimeout(this.timer);
-    if (["load", "error"].includes(data.hyrf)) this.element.fireEvent(data.hyrf, String(data.message ?? ""));
+    if (!["load", "error"].includes(data.hyrf)) return;
+    this.isLoadFailed = data.hyrf === "error";
+    this.element.fireEvent(data.hyrf, String(data.message ?? ""));
   }
 
   fail(message) {

@@ -24,6 +24,7 @@ export class InlineView {
     this.isEager = false; // whether a pending scene is also shown far from the window
     this.cameraText = null; // the camera of the scene before it was suspended
     this.isFailed = false; // whether the message is an error
+    this.isLoadFailed = false; // whether the last load has failed, so that the scene of `src` is not shown
     this.wrongAttribute = null; // the name of the attribute whose value is wrong, null for an error of the load
     this.isLost = false; // whether the browser has taken the graphics context away
     const make = (name, attributes = {}) => {
@@ -54,7 +55,7 @@ export class InlineView {
     clearTimeout(this.hintTimer);
     this.viewer?.destroy();
     this.viewer = null;
-    this.isFailed = this.isLost = this.isPending = false;
+    this.isFailed = this.isLoadFailed = this.isLost = this.isPending = false;
     this.bar.hidden = this.message.hidden = true;
     this.root.classList.remove("drawn");
   }
@@ -62,12 +63,16 @@ export class InlineView {
   // Frees the viewer until the element is near the window again, and the page has room for it.
   suspend() {
     // While another scene loads, and after it has failed, the scene that is shown is not that of `src`.
-    const isLoadFailed = this.isFailed && !this.wrongAttribute;
-    if (this.viewer?.isCurrentShown && !isLoadFailed) this.cameraText = this.viewer.cameraText;
+    if (this.viewer?.isCurrentShown && !this.isLoadFailed) this.cameraText = this.viewer.cameraText;
     this.close();
     this.isPending = true;
     this.isEager = false;
     if (this.isVisible) this.showMessage(WAITING_TEXT);
+  }
+
+  // Makes the next update load the scene again if its load has failed, or if files of it are missing.
+  forgetFailedLoad() {
+    if (this.isLoadFailed || (this.isFailed && this.wrongAttribute === "src")) this.shown.src = null;
   }
 
   // Shows a pending scene.
@@ -99,6 +104,8 @@ export class InlineView {
     if (isNew("title")) this.viewer.canvas.setAttribute("aria-label", now.title ?? "3D scene");
     if (isNew("autorotate")) this.viewer.autorotate = now.autorotate !== null && !prefersReducedMotion();
     if (isNew("src")) {
+      this.isLoadFailed = false;
+      this.hideError(this.wrongAttribute);
       this.viewer.firstCamera = now.camera;
       this.viewer.load(now.src).catch(() => {}); // the event has reported it
     } else if (isNew("camera")) {
@@ -126,8 +133,9 @@ export class InlineView {
 
   // Moves the eye to the camera of the attribute, or begins there if the scene is not shown yet.
   moveTo(camera) {
-    if (!this.viewer.isCurrentShown) this.viewer.firstCamera = camera;
-    else if (camera !== null) this.viewer.moveTo(camera);
+    const { viewer } = this;
+    if (!viewer.isCurrentShown) (viewer.currentLoad ?? viewer).firstCamera = camera;
+    else if (camera !== null) viewer.moveTo(camera);
   }
 
   create({ src, camera, title, exposure, autorotate, interaction, loading, worker }) {
@@ -147,7 +155,7 @@ export class InlineView {
       this.bar.value = progress;
       if (progress < 1) {
         this.message.hidden = true;
-        this.isFailed = false;
+        this.isFailed = this.isLoadFailed = false;
       }
       this.element.fireEvent("progress", progress);
     });
@@ -190,6 +198,7 @@ export class InlineView {
   // Shows an error until the next scene is loaded, or until the attribute whose value is wrong is corrected.
   fail({ message }, wrongAttribute = null) {
     Object.assign(this, { isFailed: true, wrongAttribute });
+    this.isLoadFailed ||= !wrongAttribute;
     this.bar.hidden = true;
     this.showMessage(message);
     this.element.fireEvent("error", message);

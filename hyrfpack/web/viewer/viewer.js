@@ -54,10 +54,10 @@ class Viewer {
     const { turntable } = this.navigation, { isHeld } = turntable;
     turntable.isHeld = () => this.screenshots > 0 || isHeld(); // the picture of a view that moves is never complete
     this.listeners = new Map(EVENTS.map((event) => [event, new Set()]));
-    this.firstCamera = camera; // for the first scene
+    this.firstCamera = camera; // of the scene of the next load
     this.progress = 0;
-    // The load whose scene is wanted, `origin` of its loader: {aborter, reject: rejects its promise, isComplete,
-    // isReported: whether "ready" was emitted}.
+    // The load whose scene is wanted, `origin` of its loader: {aborter, reject: rejects its promise, firstCamera,
+    // isComplete, isReported: whether "ready" was emitted}.
     this.currentLoad = null;
     this.screenshots = 0; // those that are being made
     this.isReady = false;
@@ -109,8 +109,7 @@ class Viewer {
     player.addEventListener("moved", () => this.emit("camera", {}));
     player.addEventListener("opened", () => {
       this.navigation.stop();
-      const camera = this.firstCamera;
-      this.firstCamera = null;
+      const camera = player.loader.origin.firstCamera;
       if (camera === null) return;
       try {
         this.camera = camera;
@@ -161,10 +160,11 @@ class Viewer {
   async load(src, options) {
     if (this.isDestroyed) throw new Error(DESTROYED_TEXT);
     this.dropLoad();
-    const load = { aborter: new AbortController(), isComplete: false, isReported: false };
+    const { firstCamera } = this;
+    const load = { aborter: new AbortController(), firstCamera, isComplete: false, isReported: false };
     const dropped = new Promise((_, reject) => (load.reject = reject));
     this.currentLoad = load;
-    this.pending = null;
+    this.pending = this.firstCamera = null;
     this.isReady = false;
     this.progress = 0;
     await Promise.race([this.show(load, src, options?.name), dropped]);
