@@ -299,14 +299,15 @@ def test_the_hint_about_the_wheel_does_not_replace_an_error(browser: Browser, ho
     assert message.startswith("gone.hyrf could not be fetched")
 
 
-def test_the_element_works_under_a_policy_of_self(browser: Browser, host: Site):
+@pytest.mark.parametrize("more", ["", "; require-trusted-types-for 'script'; trusted-types hyrf-viewer"])
+def test_the_element_works_under_a_policy_of_self(browser: Browser, host: Site, more: str):
     script = PAGE.partition("<script>")[2].partition("</script>")[0]
     host.files["/watch.js"] = script.encode()
     host.files["/strict.html"] = (
         b'<!DOCTYPE html><script src="watch.js"></script><script src="hyrf-viewer.js"></script>'
         b'<hyrf-viewer src="some scene.hyrf"></hyrf-viewer>'
     )
-    host.headers = {"Content-Security-Policy": "default-src 'self'"}
+    host.headers = {"Content-Security-Policy": f"default-src 'self'{more}"}
     browser.open(f"{host.address}/strict.html")
     wait_until(browser, LOADED_JS)
     assert not browser.evaluate("fired.some(([name]) => name === 'error')")

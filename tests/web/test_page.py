@@ -32,7 +32,7 @@ from hyrfpack.web.player import (
 UP_DIRECTION, SCENE_CENTER = np.array([0.0, -1.0, 0.0]), np.array([1000.0, -50.0, 20.0])
 SCENE_FRAME = Frame((1000.0, -50.0, 20.0), 4.0, (1.0, 1.0, 1.0))
 HOSTILE_TITLE = '</title><script>alert("x")</script>{{script}}'
-MAX_PAGE_OVERHEAD_BYTES = 109_400
+MAX_PAGE_OVERHEAD_BYTES = 109_500
 
 
 def random_splats(count: int = 1500) -> Splats:

@@ -59,7 +59,11 @@ def test_wrong_arguments_are_refused_by_a_sentence(loads: dict, what: str, words
 
 
 def test_a_policy_that_requires_trusted_types_is_named(loads: dict):
-    assert "requires Trusted Types" in loads["refusal"]
+    assert "it must allow trusted-types hyrf-viewer." in loads["refusal"]
+
+
+def test_viewers_start_workers_by_one_policy_for_trusted_types(loads: dict):
+    assert loads["policies"] == [["hyrf-viewer"], ["blob", "http"]]
 
 
 def test_setting_the_camera_that_was_read_moves_nothing(loads: dict):

@@ -10,7 +10,8 @@
 //     `firstCameras`: the cameras to which a viewer with the option `camera` moves when a scene is opened: that of a load
 //         after the first one has failed, and that of the first load
 //     `wrong`: the errors of arguments that are not valid
-//     `refusal`: the error of a page on which only trusted types may start a worker
+//     `refusal`: the error of a page that requires Trusted Types and does not allow the policy of the viewer
+//     `policies`: the policies that two viewers create on a page that allows them, and the addresses of their workers
 //     `cameras`: how far 1,000 rounds of reading and setting the camera move it (`drift`), and how far a camera that was
 //         set is from the one that is read back (`error`)
 
@@ -172,6 +173,25 @@ globalThis.Worker = class {
   }
 };
 result.refusal = await makeViewer().load(new Blob([])).catch(({ message }) => message);
+const policies = [], workers = [];
+globalThis.trustedTypes = {
+  createPolicy: (name, { createScriptURL }) => {
+    policies.push(name);
+    return { createScriptURL: (address) => ({ trusted: createScriptURL(address) }) };
+  },
+};
+globalThis.Worker = class {
+  constructor({ trusted }) {
+    workers.push(trusted.split(":")[0]);
+  }
+
+  postMessage() {}
+
+  terminate() {}
+};
+for (const workerUrl of [null, "worker.js"]) openWith({ workerUrl }).load(new Blob(["scene"])).catch(() => {});
+await wait();
+result.policies = [policies, workers];
 
 // The rows of this pose are rounded to 3 digits.
 const scene = { center: [1000, -50, 20], unit: 4, up: [0, -1, 0], target: [1000, -50, 20] };

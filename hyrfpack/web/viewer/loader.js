@@ -9,9 +9,7 @@ export class SupersededError extends Error {}
 // The browser cannot read any file. The message is for the user.
 export class StartError extends Error {}
 
-const TRUSTED_TYPES_TEXT = "A Content-Security-Policy requires Trusted Types, which the player does not support.";
-const NO_EMBEDDED_WORKER_TEXT =
-  "A Content-Security-Policy forbids the player's worker; it must allow worker-src blob:.";
+const FORBIDDEN_TEXT = "A Content-Security-Policy forbids the player's worker; it must allow ";
 
 export class Loader {
   // `content(message)` is called with each content that was read (see worker_tasks.js), one after the other. Its
@@ -31,14 +29,14 @@ export class Loader {
     this.spare = null; // the array of an old order, for reuse
     const refusal = workerAddress
       ? `The player's worker ${workerAddress} cannot be started; it must be a script on the page's site.`
-      : NO_EMBEDDED_WORKER_TEXT;
+      : `${FORBIDDEN_TEXT}worker-src blob:.`;
     const receive = (message) => this.receive(message);
     // An error without a message means that the worker's script was not allowed to run.
     const fail = (message) => this.breakDown(message ? failureOf(message) : new StartError(refusal));
     try {
       this.connection = new Connection(workerAddress, receive, fail);
     } catch (error) {
-      throw new StartError(error instanceof TypeError ? TRUSTED_TYPES_TEXT : refusal);
+      throw new StartError(error instanceof TypeError ? `${FORBIDDEN_TEXT}trusted-types hyrf-viewer.` : refusal);
     }
     this.delivered = Promise.resolve();
     this.broken = false; // true if no more of the file will arrive; the part that was shown can be decoded again

@@ -6,6 +6,7 @@ const MAX_WORKERS = 4; // each takes a thread and some memory; players share the
 
 const pool = []; // {worker, address, connections: Map of number -> Connection}
 let lastNumber = 0;
+let policy = null;
 
 // Exchanges messages with one reader of a worker.
 export class Connection {
@@ -59,11 +60,21 @@ function startWorker(address) {
   return shared;
 }
 
+// Lets a script start where a Content-Security-Policy requires Trusted Types and allows the policy "hyrf-viewer".
+function trust(address) {
+  try {
+    policy ??= trustedTypes.createPolicy("hyrf-viewer", { createScriptURL: (script) => script });
+    return policy.createScriptURL(address);
+  } catch {
+    return address; // this browser has no Trusted Types, or the policy is not allowed
+  }
+}
+
 function createWorker(address) {
-  if (address) return new Worker(address);
+  if (address) return new Worker(trust(address));
   const embedded = URL.createObjectURL(new Blob([readText("worker.js")], { type: "text/javascript" }));
   try {
-    return new Worker(embedded);
+    return createWorker(embedded);
   } finally {
     URL.revokeObjectURL(embedded);
   }
