@@ -2,6 +2,8 @@ import type { Camera, Viewer } from "./index.js";
 
 /** The element <hyrf-viewer>, which importing this module defines. */
 export interface HyrfViewerElement extends HTMLElement {
+  /** The attribute `src`; null removes it. */
+  src: string | null;
   /**
    * The viewer, or null: with the attribute `frame`, without `src`, while the element is in no page, or while it has no
    * viewer yet or any longer. A lazy element gets one when it comes near the window. A page keeps at most 12: elements

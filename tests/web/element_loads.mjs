@@ -4,7 +4,10 @@
 //     `inline`: the requests of an element at first, and how many were added when the same `src` was set: while it
 //         loads, after its load has failed, and after it has failed in the same moment as another `src` was set
 //     `shown`: the requests that the same `src` adds while its scene is shown, and while a file of it is missing
+//     `property`: the requests of an element whose property `src` was set before the class was defined, and to another
+//         address later; its attribute; and the attribute after the property was set to null
 //     `message`: whether the error is shown after the failure and after the next attempt has begun
+//     `lost`: the message while the graphics context is lost, after a wheel that is left to the page
 //     `frame`: how many frames were made at first, and by the same `src` after an error and after a load
 
 const addresses = [], frames = [], listeners = [];
@@ -38,6 +41,11 @@ class FakeElement extends EventTarget {
     const before = this.getAttribute(name);
     this.attributes.set(name, value);
     this.attributeChangedCallback?.(name, before, value);
+  }
+
+  removeAttribute(name) {
+    const before = this.getAttribute(name);
+    if (this.attributes.delete(name)) this.attributeChangedCallback?.(name, before, null);
   }
 
   append() {}
@@ -127,6 +135,19 @@ viewer.emit("ready", {});
 const afterSuccess = await addedBy(addresses, setAgain);
 viewer.emit("error", { error: new Error("a file is missing"), option: "src" });
 result.shown = [afterSuccess, await addedBy(addresses, setAgain)];
+
+Object.assign(element.view, { isNear: true, isFailed: false });
+viewer.canvas.dispatchEvent(new Event("webglcontextlost"));
+viewer.emit("ignored", { kind: "wheel" });
+result.lost = message.textContent;
+
+const early = new Viewer(), setSrc = (src) => addedBy(addresses, () => (early.src = src));
+Object.defineProperty(early, "src", { value: "early.hyrf", configurable: true, writable: true, enumerable: true });
+const earlyRequests = await addedBy(addresses, () => early.connectedCallback());
+const laterRequests = await setSrc("later.hyrf");
+const attribute = early.getAttribute("src");
+await setSrc(null);
+result.property = [earlyRequests, laterRequests, attribute, early.src];
 
 const framed = await connect({ src: "a.hyrf", player: "index.html", frame: "" });
 const send = (hyrf) => listeners.at(-1)({ source: frames.at(-1), data: { hyrf, message: "" } });

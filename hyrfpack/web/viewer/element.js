@@ -50,7 +50,22 @@ class HyrfViewerElement extends (globalThis.HTMLElement ?? class {}) {
     return this.view?.viewer ?? null;
   }
 
+  // The attribute `src`; null removes it.
+  get src() {
+    return this.getAttribute("src");
+  }
+
+  set src(address) {
+    if (address === null || address === undefined) this.removeAttribute("src");
+    else this.setAttribute("src", address);
+  }
+
   connectedCallback() {
+    if (Object.hasOwn(this, "src")) { // it was set before this class was defined, and hides the property
+      const { src } = this;
+      delete this.src;
+      this.src = src;
+    }
     this.view?.reconnect?.();
     this.schedule();
   }

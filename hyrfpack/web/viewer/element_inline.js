@@ -204,9 +204,9 @@ export class InlineView {
     this.element.fireEvent("error", message);
   }
 
-  // Shows a hint for a moment, but not in place of an error.
+  // Shows a hint for a moment, but not in place of an error, or while the graphics context is lost.
   hint(text) {
-    if (this.isFailed) return;
+    if (this.isFailed || this.isLost) return;
     this.showMessage(text);
     this.hintTimer = setTimeout(() => (this.message.hidden = true), HINT_MS);
   }
