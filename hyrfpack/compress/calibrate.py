@@ -22,6 +22,7 @@ from hyrfpack.compress.plan import distortion_per_number, indices_to_keep
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.sensitivity import TARGET_DRAWN_GAUSSIANS, Sensitivity, measure_sensitivity
 from hyrfpack.model import HybridModel
+from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress, round_of_progress
 from hyrfpack.scene import Camera
 
@@ -57,6 +58,7 @@ def measure_calibrated_sensitivity(
     return calibrated, replace(references, colors=[])  # Colours take memory, and only calibration uses them.
 
 
+@torch_on_one_thread()
 def calibrate(
     model: HybridModel,
     sensitivity: Sensitivity,

@@ -19,11 +19,13 @@ from hyrfpack.compress.sensitivity import (
 )
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel
+from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
 
 
+@torch_on_one_thread()
 def measure_removals(
     model: HybridModel | MergedModel, cameras: Sequence[Camera], progress: Progress = ignore_progress
 ) -> np.ndarray:

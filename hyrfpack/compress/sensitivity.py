@@ -22,6 +22,7 @@ from hyrfpack.format.sections import (
 )
 from hyrfpack.model import Geometry, HybridModel, expand
 from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import render_view
 from hyrfpack.render.in_view import gaussians_in_view
@@ -110,6 +111,7 @@ class Sensitivity:
         return Sensitivity(positions, colors, scales, opacities, removals, fields, shapes, harmonics)
 
 
+@torch_on_one_thread()
 def measure_sensitivity(
     model: HybridModel,
     cameras: Sequence[Camera],

@@ -243,6 +243,18 @@ def test_measuring_changes_neither_the_model_nor_the_random_state():
     assert torch.equal(torch.get_rng_state(), state)
 
 
+def test_torch_measures_on_one_thread_and_keeps_its_number_of_threads_afterwards():
+    before, during = torch.get_num_threads(), set()
+    torch.set_num_threads(2)
+    try:
+        measure_sensitivity(ball_model(), RING_CAMERAS[:2], progress=lambda event: during.add(torch.get_num_threads()))
+        after = torch.get_num_threads()
+    finally:
+        torch.set_num_threads(before)
+
+    assert (during, after) == ({1}, 2)
+
+
 def test_sensitivities_have_the_shapes_of_the_stored_arrays():
     model = ball_model()
 
