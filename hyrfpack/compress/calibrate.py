@@ -16,8 +16,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import torch
+
 from hyrfpack.compress.correction import SensitivityCorrection
-from hyrfpack.compress.part_errors import PartErrors, PruningErrors, QuantizationErrors, subset_decoded
+from hyrfpack.compress.part_errors import PartErrors, PruningErrors, QuantizationErrors
 from hyrfpack.compress.plan import distortion_per_number, indices_to_keep
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.sensitivity import TARGET_DRAWN_GAUSSIANS, Sensitivity, measure_sensitivity
@@ -59,6 +61,7 @@ def measure_calibrated_sensitivity(
 
 
 @torch_on_one_thread()
+@torch.no_grad()
 def calibrate(
     model: HybridModel,
     sensitivity: Sensitivity,
@@ -80,15 +83,18 @@ def calibrate(
     """
     if not sensitivity.is_seen:
         return sensitivity
-    decoded = model.decode()
+    outputs = model.geometry_outputs()
+    geometry = model.geometry_from_outputs(outputs)
     # Pruning is calibrated first, because the errors of the other parts depend on which Gaussians are left.
     if prune:
-        pruning = PruningErrors(model, decoded, references, distortion)
+        pruning = PruningErrors(model, geometry, references, distortion)
         sensitivity = _match_measurements(sensitivity, pruning, distortion, part_of_progress(progress, 0.0, 0.2))
     kept = indices_to_keep(sensitivity, distortion_per_number(model, distortion), prune)
-    pruned, decoded = subset_decoded(model, decoded, kept)
+    index = torch.as_tensor(kept, device=outputs.device)
+    pruned, outputs = model.subset(index), outputs[index]
+    decoded = pruned.add_shading(geometry[index])
     references = ReferenceRenders.from_views(references.views, pruned, decoded, references.colors_of(kept))
-    quantization = QuantizationErrors(model, pruned, decoded, references, distortion, prune)
+    quantization = QuantizationErrors(model, pruned, decoded, outputs, references, distortion, prune)
     return _match_measurements(sensitivity, quantization, distortion, part_of_progress(progress, 0.2, 1.0))
 
 

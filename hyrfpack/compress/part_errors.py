@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from hyrfpack.compress.plan import distortion_per_number, indices_to_keep, make_plan
-from hyrfpack.compress.quantize import field_opacity_logits, opacity_error_model, quantize
+from hyrfpack.compress.quantize import opacity_column, opacity_error_model, quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.residuals import residual_sensitivity
 from hyrfpack.compress.sensitivity import PRUNED_KEY, Sensitivity
@@ -32,7 +32,7 @@ from hyrfpack.format.sections import (
     SHAPES,
     TABLE_SECTIONS,
 )
-from hyrfpack.model import Decoded, HybridModel
+from hyrfpack.model import Decoded, Geometry, HybridModel
 from hyrfpack.progress import Progress, TaskEvent
 
 # The sections that are quantised and compared together. A decoder has so few numbers that its error depends on chance,
@@ -84,13 +84,13 @@ class PruningErrors:
 
     Attributes:
         model: the model to compress.
-        decoded: the result of `model.decode()`.
+        geometry: the geometry of its Gaussians.
         references: renders of the model.
         distortion: as in `make_plan`.
     """
 
     model: HybridModel
-    decoded: Decoded
+    geometry: Geometry
     references: ReferenceRenders
     distortion: float
     parts: tuple[Part, ...] = ((PRUNED_KEY,),)
@@ -100,8 +100,11 @@ class PruningErrors:
         progress(TaskEvent("calibrating the prediction of pruning errors", 0.0))
         kept = indices_to_keep(sensitivity, distortion_per_number(self.model, self.distortion))
         predicted = float(np.delete(sensitivity.removals, kept).sum())
-        model, decoded = subset_decoded(self.model, self.decoded, kept)
-        measured = self.references.measure_error(model, decoded, self.references.colors_of(kept))
+        index = torch.as_tensor(kept, device=self.geometry.opacities.device)
+        # The colours are known, so the shading is not needed.
+        decoded = Decoded(self.geometry[index], shading=None)
+        pruned, colors = self.model.subset(index), self.references.colors_of(kept)
+        measured = self.references.measure_error(pruned, decoded, colors)
         return {part: ErrorMeasurement(measured, predicted) for part in parts}
 
 
@@ -114,6 +117,7 @@ class QuantizationErrors:
         model: the model to compress, before pruning.
         pruned: the model after pruning.
         decoded: the result of `pruned.decode()`.
+        geometry_outputs: (M, 8) the result of `pruned.geometry_outputs()`.
         references: renders of the pruned model.
         distortion, prune: as in `make_plan`.
     """
@@ -121,12 +125,13 @@ class QuantizationErrors:
     model: HybridModel
     pruned: HybridModel
     decoded: Decoded
+    geometry_outputs: torch.Tensor
     references: ReferenceRenders
     distortion: float
     prune: bool
     # The sensitivities of positions that the last plan was made for; the plan; the planned model and its
-    # `field_opacity_logits`.
-    _last_plan: tuple[np.ndarray, Plan, HybridModel, np.ndarray] | None = field(default=None, init=False)
+    # `geometry_outputs()`.
+    _last_plan: tuple[np.ndarray, Plan, HybridModel, torch.Tensor] | None = field(default=None, init=False)
     parts: tuple[Part, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -135,7 +140,8 @@ class QuantizationErrors:
 
     def measure(self, sensitivity: Sensitivity, parts: list[Part], progress: Progress) -> dict[Part, ErrorMeasurement]:
         """Quantise all of `parts` and measure the error of each one alone, see `PartErrors.measure`."""
-        plan, planned, field_logits = self._plan(sensitivity)
+        plan, planned, outputs = self._plan(sensitivity)
+        field_logits = opacity_column(outputs)
         names = [name for part in parts for name in part]
         quantized = quantize(planned, plan, sensitivity, sections=names, field_logits=field_logits)
         predicted = _predict_quantization_errors(planned, quantized, sensitivity, field_logits)
@@ -144,34 +150,36 @@ class QuantizationErrors:
         for number, part in enumerate(parts):
             contents = " and ".join(SECTION_CONTENTS[name] for name in part)
             progress(TaskEvent(f"calibrating predicted errors of {contents}", number / len(parts)))
-            measured = self._measure_part(part, planned, arrays)
+            measured = self._measure_part(part, planned, outputs, arrays)
             errors[part] = ErrorMeasurement(measured, sum(predicted[name] for name in part))
         return errors
 
-    def _plan(self, sensitivity: Sensitivity) -> tuple[Plan, HybridModel, np.ndarray]:
-        """Return a plan, the planned model and its `field_opacity_logits`.
+    def _plan(self, sensitivity: Sensitivity) -> tuple[Plan, HybridModel, torch.Tensor]:
+        """Return a plan, the planned model and its `geometry_outputs()`.
 
         They are made again only if the sensitivities of positions changed.
         """
         if self._last_plan is None or not np.array_equal(self._last_plan[0], sensitivity.positions):
             plan = make_plan(self.model, sensitivity, self.distortion, self.prune)
             planned = plan.apply(self.model)
-            self._last_plan = sensitivity.positions, plan, planned, field_opacity_logits(planned)
+            self._last_plan = sensitivity.positions, plan, planned, planned.geometry_outputs()
         return self._last_plan[1:]
 
-    def _measure_part(self, part: Part, planned: HybridModel, arrays: dict[str, np.ndarray]) -> float:
+    def _measure_part(
+        self,
+        part: Part,
+        planned: HybridModel,
+        planned_outputs: torch.Tensor,
+        arrays: dict[str, np.ndarray],
+    ) -> float:
         """Measure the error of the pruned model with the quantised numbers `arrays` of one part, or on the lattice."""
         if part == (POSITIONS,):
-            return self.references.measure_error(planned)
+            decoded = planned.add_shading(planned.geometry_from_outputs(planned_outputs))
+            return self.references.measure_error(planned, decoded)
         changed = _replace_arrays(self.pruned, {name: arrays[name] for name in part})
         colors = None if COLOR_SECTIONS.intersection(part) else self.references.colors
-        return self.references.measure_error(changed, update_decoded(changed, self.decoded, part), colors)
-
-
-def subset_decoded(model: HybridModel, decoded: Decoded, kept: np.ndarray) -> tuple[HybridModel, Decoded]:
-    """Return the Gaussians at the indices `kept` (n,) of a model, and of the result of its `decode()`."""
-    index = torch.as_tensor(kept, device=model.gaussians.positions.device)
-    return model.subset(index), decoded[index]
+        decoded = update_decoded(changed, self.decoded, part, self.geometry_outputs)
+        return self.references.measure_error(changed, decoded, colors)
 
 
 def predict_errors(
@@ -231,12 +239,21 @@ def _replace_arrays(model: HybridModel, arrays: dict[str, np.ndarray]) -> Hybrid
     return changed
 
 
-def update_decoded(model: HybridModel, before: Decoded, part: Part) -> Decoded:
-    """Decode a model again after one part changed, reusing the results `before` that do not depend on this part."""
+def update_decoded(model: HybridModel, before: Decoded, part: Part, geometry_outputs: torch.Tensor) -> Decoded:
+    """Decode a model again after one part changed, reusing the results that do not depend on this part.
+
+    Args:
+        model: the model after the change.
+        before: the result of `decode()` before it.
+        part: the part.
+        geometry_outputs: (N, 8) the result of `geometry_outputs()` before the change.
+    """
     if HARMONICS in part:  # are evaluated for each view
         return before
-    if GEOMETRY_TABLE in part or OPACITIES in part or SHAPES in part:
+    if GEOMETRY_TABLE in part:
         return replace(before, geometry=model.decode_geometry())
+    if OPACITIES in part or SHAPES in part:
+        return replace(before, geometry=model.geometry_from_outputs(geometry_outputs))
     if before.shading is None:
         return before
     if RADIANCE_TABLE in part:

@@ -126,10 +126,14 @@ def _offset_error(error: ErrorModel, start: int, places: Any, candidates: np.nda
     return error(places + start, candidates)
 
 
-@torch.no_grad()
 def field_opacity_logits(model: HybridModel) -> np.ndarray:
     """Return what the geometry field adds to the explicit opacity logits of a model, (M,) float64."""
-    return model.geometry(model.cube_coords(model.gaussians.positions))[:, 0].double().cpu().numpy()
+    return opacity_column(model.geometry_outputs())
+
+
+def opacity_column(geometry_outputs: torch.Tensor) -> np.ndarray:
+    """Return `field_opacity_logits` of a model, (M,) float64, from the result (M, 8) of its `geometry_outputs()`."""
+    return geometry_outputs[:, 0].double().cpu().numpy()
 
 
 def opacity_error_model(

@@ -22,7 +22,7 @@ from hyrfpack.ops.rows import take_rows
 from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_views, shade
 from hyrfpack.ops.viewport import Viewport
 
-GAUSSIANS_PER_SHADING_BLOCK = 1 << 20  # This bounds the memory of hash features in `HybridModel.shading`.
+GAUSSIANS_PER_SHADING_BLOCK = 1 << 18  # This bounds the memory of hash features in `HybridModel.shading`.
 
 
 @dataclass(frozen=True)
@@ -162,8 +162,13 @@ class HybridModel(nn.Module):
 
         The result takes 4 (hidden + 8) bytes per Gaussian, or 2 hidden + 32 with mixed precision on a GPU.
         """
+        return self.add_shading(self.decode_geometry())
+
+    @torch.no_grad()
+    def add_shading(self, geometry: Geometry) -> Decoded:
+        """Return what `decode` does, given the geometry of all Gaussians."""
         is_faster = self.gaussians.positions.device.type in ("cpu", "cuda") and not self.radiance.is_constant_zero
-        return Decoded(self.decode_geometry(), self.shading() if is_faster else None)
+        return Decoded(geometry, self.shading() if is_faster else None)
 
     @torch.no_grad()
     def shading(self) -> Shading:
@@ -171,13 +176,12 @@ class HybridModel(nn.Module):
         field, explicit = self.radiance, self.gaussians
         places = field.grid.feature_count
         (weight, w2, w3), (bias, b2, b3) = self._color_layers()
-        rows = [
-            mlp(field.grid(self.cube_coords(some)), [weight[:, :places]], [bias], mixed=self._mixed)
-            for some in explicit.positions.split(GAUSSIANS_PER_SHADING_BLOCK)
-        ]
-        first = rows[0] if len(rows) == 1 else torch.cat(rows)  # one block needs no copy
+        first = weight.new_empty(len(self), len(bias), dtype=torch.bfloat16 if self._mixed else None)
+        size = GAUSSIANS_PER_SHADING_BLOCK
+        for some, rows in zip(explicit.positions.split(size), first.split(size), strict=True):
+            rows.copy_(mlp(field.grid(self.cube_coords(some)), [weight[:, :places]], [bias], mixed=self._mixed))
         return Shading(
-            first.bfloat16() if self._mixed else first,
+            first,
             weight[:, places:].contiguous(),
             (w2, w3),
             (b2, b3),
@@ -185,6 +189,19 @@ class HybridModel(nn.Module):
             self.config.direction_encoding,
             self._mixed,
         )
+
+    @torch.no_grad()
+    def geometry_outputs(self) -> Tensor:
+        """Return the raw outputs (N, 8) of the geometry field at all Gaussians; they do not depend on their logits."""
+        return self.geometry(self.cube_coords(self.gaussians.positions), mixed=self._mixed)
+
+    @torch.no_grad()
+    def geometry_from_outputs(self, outputs: Tensor) -> Geometry:
+        """Return what `decode_geometry` does for all Gaussians, given the result (N, 8) of `geometry_outputs`."""
+        explicit = self.gaussians
+        if explicit.shape_residuals is not None:
+            outputs = add_shape_residuals(outputs, explicit.shape_residuals)
+        return self.activate(outputs, explicit.positions, explicit.scale_logits, explicit.opacity_logits)
 
     def decode_geometry(self, index: Tensor | None = None, used: Tensor | None = None) -> Geometry:
         """Return scales, rotations and opacities of the Gaussians at `index` (n,) int64, or of all.
