@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from hyrfpack.compress.rate_distortion import LAMBDA_PER_DISTORTION
 from hyrfpack.compress.sensitivity import Sensitivity
@@ -14,6 +13,7 @@ from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE
 from hyrfpack.format.compact.plan import Layer, Plan, build_step_groups
 from hyrfpack.format.sections import COLORS, DECODER_SECTIONS, TABLE_SECTIONS
 from hyrfpack.model import HybridModel
+from hyrfpack.parallel.pool import map_row_blocks
 from hyrfpack.quant.morton import MAX_BITS_PER_AXIS
 from hyrfpack.quant.points import LatticePoints, encode_points
 
@@ -83,10 +83,11 @@ def indices_to_keep(sensitivity: Sensitivity, per_number: float, prune: bool = T
     return np.flatnonzero(removals >= least)
 
 
-@torch.no_grad()
 def _cube_coords(model: HybridModel) -> np.ndarray:
     """Return the Gaussians' coordinates in the contracted cube, (N, 3) float64."""
-    return model.cube_coords(model.gaussians.positions.double()).cpu().numpy()
+    positions = model.gaussians.positions.detach()
+    coords = map_row_blocks(lambda rows: model.cube_coords(positions[rows].double()), len(positions), positions.device)
+    return coords.cpu().numpy()
 
 
 def replan_moved(plan: Plan, model: HybridModel) -> tuple[Plan, HybridModel]:

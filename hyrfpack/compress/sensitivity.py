@@ -22,7 +22,7 @@ from hyrfpack.format.sections import (
 )
 from hyrfpack.model import Geometry, HybridModel, expand
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.parallel.pool import torch_on_one_thread
+from hyrfpack.parallel.pool import map_row_blocks, torch_on_one_thread
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import render_view
 from hyrfpack.render.in_view import gaussians_in_view
@@ -331,13 +331,18 @@ def _fit_prior(cells: np.ndarray, measured: np.ndarray, guess: np.ndarray) -> np
     return guess * ((sums[0] + overall * weight) / (sums[1] + weight))[cells]
 
 
-@torch.enable_grad()
 def _cube_jacobian(model: HybridModel) -> torch.Tensor:
     """Return d local position / d cube coordinate, (N, 3, 3): rows are local axes, columns are cube axes."""
-    cube = model.cube_coords(model.gaussians.positions.detach().double()).requires_grad_()
-    local = expand(cube) * cube.new_tensor(model.config.frame.half_extent)
-    rows = [torch.autograd.grad(local[:, axis].sum(), cube, retain_graph=True)[0] for axis in range(3)]
-    return torch.stack(rows, dim=1).float()
+    positions = model.gaussians.positions.detach()
+
+    @torch.enable_grad()
+    def differentiate(rows: slice) -> torch.Tensor:
+        cube = model.cube_coords(positions[rows].double()).requires_grad_()
+        local = expand(cube) * cube.new_tensor(model.config.frame.half_extent)
+        axes = [torch.autograd.grad(local[:, axis].sum(), cube, retain_graph=True)[0] for axis in range(3)]
+        return torch.stack(axes, dim=1).float()
+
+    return map_row_blocks(differentiate, len(positions), positions.device)
 
 
 @torch.no_grad()
@@ -376,13 +381,20 @@ def _expected_light(
     model: HybridModel, geometry: Geometry, cameras: Sequence[Camera]
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the sum over cameras of the share of the picture times opacity squared (N,), and the area (N,)."""
-    sides = geometry.scales.double().sort(dim=1).values
-    area, opacities = sides[:, 1] * sides[:, 2], geometry.opacities.double()
-    total = torch.zeros_like(area)
-    frame = model.config.frame
-    positions = model.gaussians.positions.double()
-    for camera in cameras:
-        place = torch.as_tensor(frame.to_local(camera.position)).to(positions)
-        distance = torch.linalg.vector_norm(positions - place, dim=1).clamp_min(MIN_CAMERA_DISTANCE_LOCAL)
-        total += (area * (camera.fx * camera.fy / (camera.width * camera.height)) / distance**2).clamp_max(1)
-    return total * opacities**2, area
+    positions, frame = model.gaussians.positions.detach(), model.config.frame
+    places = [
+        torch.as_tensor(frame.to_local(camera.position)).to(positions.device, torch.float64) for camera in cameras
+    ]
+    shares = [camera.fx * camera.fy / (camera.width * camera.height) for camera in cameras]
+
+    def measure_light_and_area(rows: slice) -> torch.Tensor:
+        sides = geometry.scales[rows].double().sort(dim=1).values
+        area, some = sides[:, 1] * sides[:, 2], positions[rows].double()
+        total = torch.zeros_like(area)
+        for place, share in zip(places, shares, strict=True):
+            distance = torch.linalg.vector_norm(some - place, dim=1).clamp_min(MIN_CAMERA_DISTANCE_LOCAL)
+            total += (area * share / distance**2).clamp_max(1)
+        return torch.stack((total * geometry.opacities[rows].double() ** 2, area), dim=1)
+
+    light, area = map_row_blocks(measure_light_and_area, len(positions), positions.device).unbind(dim=1)
+    return light, area

@@ -24,6 +24,7 @@ T = TypeVar("T")
 
 # The largest size of kept blocks that older versions of glibc accept.
 MAX_OLD_MMAP_THRESHOLD_BYTES = 1 << 25
+ROWS_PER_BLOCK = 1 << 14
 
 _thread_state = threading.local()
 
@@ -192,6 +193,21 @@ def parallel_map(
 
     run_tasks(run, len(items))
     return [done[index] for index in range(len(items))]
+
+
+def map_row_blocks(function: Callable[[slice], torch.Tensor], rows: int, device: torch.device) -> torch.Tensor:
+    """Call a function for blocks of rows on the threads of the pool and join its results (n, ...) along the rows.
+
+    Large element-wise operations run faster in blocks, because their temporary arrays then stay in the caches.
+
+    Args:
+        function: called without gradients with the rows of each block; their values must not depend on other rows.
+        rows: number of rows.
+        device: as `parallel_map` takes it.
+    """
+    starts = range(0, max(rows, 1), ROWS_PER_BLOCK)
+    blocks = [slice(start, min(start + ROWS_PER_BLOCK, rows)) for start in starts]
+    return torch.cat(parallel_map(torch.no_grad()(function), blocks, device))
 
 
 def run_jobs(jobs: dict[str, Callable[[], T]]) -> dict[str, T]:

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from hyrfpack.parallel import pool
-from hyrfpack.parallel.pool import parallel_map, run_jobs, run_tasks
+from hyrfpack.parallel.pool import ROWS_PER_BLOCK, map_row_blocks, parallel_map, run_jobs, run_tasks
 
 
 @pytest.fixture(autouse=True)
@@ -25,6 +25,15 @@ def test_results_have_the_order_of_the_items_and_the_names_of_the_jobs() -> None
     assert parallel_map(lambda number: number**2, list(range(50))) == [number**2 for number in range(50)]
     assert run_jobs({name: name.upper for name in "cab"}) == {"c": "C", "a": "A", "b": "B"}
     assert parallel_map(abs, []) == []
+
+
+@pytest.mark.parametrize("count", [0, 1, ROWS_PER_BLOCK, 2 * ROWS_PER_BLOCK + 1])
+def test_blocks_of_rows_are_joined_in_order_without_gradients(count: int) -> None:
+    values = torch.arange(2.0 * count).reshape(count, 2).requires_grad_()
+
+    doubled = map_row_blocks(lambda rows: 2 * values[rows], count, values.device)
+
+    assert torch.equal(doubled, 2 * values) and not doubled.requires_grad
 
 
 def test_two_items_are_processed_at_the_same_time() -> None:
