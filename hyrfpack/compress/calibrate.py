@@ -23,7 +23,7 @@ from hyrfpack.compress.part_errors import PartErrors, PruningErrors, Quantizatio
 from hyrfpack.compress.plan import distortion_per_number, indices_to_keep
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.sensitivity import TARGET_DRAWN_GAUSSIANS, Sensitivity, measure_sensitivity
-from hyrfpack.model import HybridModel
+from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress, round_of_progress
 from hyrfpack.scene import Camera
@@ -52,11 +52,18 @@ def measure_calibrated_sensitivity(
     Raises:
         HyrfError: a number of the model is NaN or infinite.
     """
-    sensitivity = measure_sensitivity(model, cameras, progress=part_of_progress(progress, 0.0, 0.5), drawn=drawn)
-    progress(TaskEvent("rendering reference views", 0.5))
+    progress(TaskEvent("rendering reference views", 0.0))
     references = ReferenceRenders.from_model(model, cameras)
-    rest = part_of_progress(progress, 0.55, 1.0)
-    calibrated = calibrate(model, sensitivity, references, distortion, prune, rest)
+    measuring, calibrating = part_of_progress(progress, 0.05, 0.55), part_of_progress(progress, 0.55, 1.0)
+    # The sensitivities are not kept in a variable, so that their memory is free once they are scaled.
+    calibrated = calibrate(
+        model,
+        measure_sensitivity(model, cameras, progress=measuring, drawn=drawn),
+        references,
+        distortion,
+        prune,
+        calibrating,
+    )
     return calibrated, replace(references, colors=[])  # Colours take memory, and only calibration uses them.
 
 
@@ -87,14 +94,15 @@ def calibrate(
     geometry = model.geometry_from_outputs(outputs)
     # Pruning is calibrated first, because the errors of the other parts depend on which Gaussians are left.
     if prune:
-        pruning = PruningErrors(model, geometry, references, distortion)
-        sensitivity = _match_measurements(sensitivity, pruning, distortion, part_of_progress(progress, 0.0, 0.2))
+        errors = PruningErrors(model, geometry, references, distortion)
+        sensitivity = _match_measurements(sensitivity, errors, distortion, part_of_progress(progress, 0.0, 0.2))
+        del errors  # and with it the geometry of all Gaussians, once only that of the others is needed
     kept = indices_to_keep(sensitivity, distortion_per_number(model, distortion), prune)
     index = torch.as_tensor(kept, device=outputs.device)
-    pruned, outputs = model.subset(index), outputs[index]
-    decoded = pruned.add_shading(geometry[index])
-    references = ReferenceRenders.from_views(references.views, pruned, decoded, references.colors_of(kept))
-    quantization = QuantizationErrors(model, pruned, decoded, outputs, references, distortion, prune)
+    pruned, outputs, geometry = model.subset(index), outputs[index], geometry[index]
+    decoded, colors = Decoded(geometry, shading=None), references.colors_of(kept)
+    references = ReferenceRenders.from_views(references.views, pruned, decoded, colors)
+    quantization = QuantizationErrors(model, pruned, geometry, outputs, references, distortion, prune)
     return _match_measurements(sensitivity, quantization, distortion, part_of_progress(progress, 0.2, 1.0))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -104,7 +104,7 @@ class PruningErrors:
         # The colours are known, so the shading is not needed.
         decoded = Decoded(self.geometry[index], shading=None)
         pruned, colors = self.model.subset(index), self.references.colors_of(kept)
-        measured = self.references.measure_error(pruned, decoded, colors)
+        measured = self.references.measure_error(pruned, decoded, colors, predicted)
         return {part: ErrorMeasurement(measured, predicted) for part in parts}
 
 
@@ -116,7 +116,7 @@ class QuantizationErrors:
         parts: the parts that the model has.
         model: the model to compress, before pruning.
         pruned: the model after pruning.
-        decoded: the result of `pruned.decode()`.
+        geometry: the geometry of its Gaussians.
         geometry_outputs: (M, 8) the result of `pruned.geometry_outputs()`.
         references: renders of the pruned model.
         distortion, prune: as in `make_plan`.
@@ -124,7 +124,7 @@ class QuantizationErrors:
 
     model: HybridModel
     pruned: HybridModel
-    decoded: Decoded
+    geometry: Geometry
     geometry_outputs: torch.Tensor
     references: ReferenceRenders
     distortion: float
@@ -144,14 +144,15 @@ class QuantizationErrors:
         field_logits = opacity_column(outputs)
         names = [name for part in parts for name in part]
         quantized = quantize(planned, plan, sensitivity, sections=names, field_logits=field_logits)
-        predicted = _predict_quantization_errors(planned, quantized, sensitivity, field_logits)
+        by_section = _predict_quantization_errors(planned, quantized, sensitivity, field_logits)
         arrays = _undo_plan_order(quantized)
         errors = {}
         for number, part in enumerate(parts):
             contents = " and ".join(SECTION_CONTENTS[name] for name in part)
             progress(TaskEvent(f"calibrating predicted errors of {contents}", number / len(parts)))
-            measured = self._measure_part(part, planned, outputs, arrays)
-            errors[part] = ErrorMeasurement(measured, sum(predicted[name] for name in part))
+            predicted = sum(by_section[name] for name in part)
+            measured = self._measure_part(part, planned, outputs, arrays, predicted)
+            errors[part] = ErrorMeasurement(measured, predicted)
         return errors
 
     def _plan(self, sensitivity: Sensitivity) -> tuple[Plan, HybridModel, torch.Tensor]:
@@ -171,15 +172,16 @@ class QuantizationErrors:
         planned: HybridModel,
         planned_outputs: torch.Tensor,
         arrays: dict[str, np.ndarray],
+        predicted: float,
     ) -> float:
         """Measure the error of the pruned model with the quantised numbers `arrays` of one part, or on the lattice."""
         if part == (POSITIONS,):
             decoded = planned.add_shading(planned.geometry_from_outputs(planned_outputs))
-            return self.references.measure_error(planned, decoded)
+            return self.references.measure_error(planned, decoded, predicted=predicted)
         changed = _replace_arrays(self.pruned, {name: arrays[name] for name in part})
         colors = None if COLOR_SECTIONS.intersection(part) else self.references.colors
-        decoded = update_decoded(changed, self.decoded, part, self.geometry_outputs)
-        return self.references.measure_error(changed, decoded, colors)
+        decoded = decode_changed(changed, part, self.geometry, self.geometry_outputs)
+        return self.references.measure_error(changed, decoded, colors, predicted)
 
 
 def predict_errors(
@@ -239,23 +241,17 @@ def _replace_arrays(model: HybridModel, arrays: dict[str, np.ndarray]) -> Hybrid
     return changed
 
 
-def update_decoded(model: HybridModel, before: Decoded, part: Part, geometry_outputs: torch.Tensor) -> Decoded:
-    """Decode a model again after one part changed, reusing the results that do not depend on this part.
+def decode_changed(model: HybridModel, part: Part, geometry: Geometry, geometry_outputs: torch.Tensor) -> Decoded:
+    """Decode a model after one part changed, apart from what depends on neither this part nor the view.
 
     Args:
         model: the model after the change.
-        before: the result of `decode()` before it.
-        part: the part.
+        part: the part. Unless it is in COLOR_SECTIONS, the result has no shading, because the colours are known.
+        geometry: the geometry of the Gaussians before the change.
         geometry_outputs: (N, 8) the result of `geometry_outputs()` before the change.
     """
-    if HARMONICS in part:  # are evaluated for each view
-        return before
+    if COLOR_SECTIONS.intersection(part):
+        return model.add_shading(geometry)
     if GEOMETRY_TABLE in part:
-        return replace(before, geometry=model.decode_geometry())
-    if OPACITIES in part or SHAPES in part:
-        return replace(before, geometry=model.geometry_from_outputs(geometry_outputs))
-    if before.shading is None:
-        return before
-    if RADIANCE_TABLE in part:
-        return replace(before, shading=model.shading())
-    return replace(before, shading=replace(before.shading, color_logits=model.gaussians.color_logits.detach()))
+        return Decoded(model.decode_geometry(), shading=None)
+    return Decoded(model.geometry_from_outputs(geometry_outputs), shading=None)

@@ -22,7 +22,7 @@ from hyrfpack.ops.rows import take_rows
 from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_views, shade
 from hyrfpack.ops.viewport import Viewport
 
-GAUSSIANS_PER_SHADING_BLOCK = 1 << 18  # This bounds the memory of hash features in `HybridModel.shading`.
+GAUSSIANS_PER_BLOCK = 1 << 18  # of those for which a field is evaluated at once, unless gradients are recorded
 
 
 @dataclass(frozen=True)
@@ -177,8 +177,7 @@ class HybridModel(nn.Module):
         places = field.grid.feature_count
         (weight, w2, w3), (bias, b2, b3) = self._color_layers()
         first = weight.new_empty(len(self), len(bias), dtype=torch.bfloat16 if self._mixed else None)
-        size = GAUSSIANS_PER_SHADING_BLOCK
-        for some, rows in zip(explicit.positions.split(size), first.split(size), strict=True):
+        for some, rows in zip(self._blocks(explicit.positions), self._blocks(first), strict=True):
             rows.copy_(mlp(field.grid(self.cube_coords(some)), [weight[:, :places]], [bias], mixed=self._mixed))
         return Shading(
             first,
@@ -193,7 +192,15 @@ class HybridModel(nn.Module):
     @torch.no_grad()
     def geometry_outputs(self) -> Tensor:
         """Return the raw outputs (N, 8) of the geometry field at all Gaussians; they do not depend on their logits."""
-        return self.geometry(self.cube_coords(self.gaussians.positions), mixed=self._mixed)
+        outputs = self.gaussians.positions.new_empty(len(self), 8)
+        for some, rows in zip(self._blocks(self.gaussians.positions), self._blocks(outputs), strict=True):
+            rows.copy_(self.geometry(self.cube_coords(some), mixed=self._mixed))
+        return outputs
+
+    @staticmethod
+    def _blocks(rows: Tensor) -> tuple[Tensor, ...]:
+        """Split rows (N, ...) into blocks, which bound the memory of hash features."""
+        return rows.split(GAUSSIANS_PER_BLOCK)
 
     @torch.no_grad()
     def geometry_from_outputs(self, outputs: Tensor) -> Geometry:
