@@ -19,6 +19,9 @@ from hyrfpack.format.sections import (
 
 # A part that takes 1.4 times its share of the error costs less than 1 % more bits than the best split.
 PREDICTION_TOLERANCE_RATIO = 1.4
+# Positions have steps of powers of two, so their error jumps where a class gets another step. A factor between two such
+# steps is not searched for: half of the predicted error is close enough.
+MIN_POSITION_ERROR_RATIO = 0.5
 MAX_CORRECTION_RATIO = 64.0
 # Factors to measure first: medians of those found for trained models of twelve captures.
 TYPICAL_FACTORS: dict[Part, float] = {
@@ -43,8 +46,9 @@ class CorrectionFactor:
         exponent: power of measured over predicted error to multiply by; re-estimated once two factors were measured.
         value: the best factor known, which is measured next unless it has converged.
         low, high: the largest factor measured to be too small, and the smallest measured to be large enough.
-        converged: whether predicted and measured error agree within PREDICTION_TOLERANCE_RATIO.
+        converged: whether measured over predicted error lies between `min_ratio` and PREDICTION_TOLERANCE_RATIO.
         last: the factor measured last, and its ratio of measured to predicted error; None before the first.
+        min_ratio: the lowest ratio of measured to predicted error that counts as converged.
     """
 
     exponent: float
@@ -53,6 +57,7 @@ class CorrectionFactor:
     high: float = np.inf
     converged: bool = False
     last: tuple[float, float] | None = None
+    min_ratio: float = 1 / PREDICTION_TOLERANCE_RATIO
 
     def update(self, ratio: float) -> None:
         """Choose the next factor, given the ratio of measured to predicted error at the current `value`."""
@@ -67,7 +72,7 @@ class CorrectionFactor:
             self.low = max(self.low, self.value)
         else:
             self.high = min(self.high, self.value)
-        if 1 / PREDICTION_TOLERANCE_RATIO < ratio < PREDICTION_TOLERANCE_RATIO:
+        if self.min_ratio < ratio < PREDICTION_TOLERANCE_RATIO:
             self.converged = True
         elif self.high < PREDICTION_TOLERANCE_RATIO * self.low:
             self.value, self.converged = self.high, True
@@ -86,6 +91,8 @@ class SensitivityCorrection:
             part: CorrectionFactor(CORRECTION_EXPONENTS.get(part, 1.0), TYPICAL_FACTORS.get(part, 1.0))
             for part in parts
         }
+        if (POSITIONS,) in self._factors:
+            self._factors[POSITIONS,].min_ratio = MIN_POSITION_ERROR_RATIO
 
     @property
     def remaining(self) -> list[Part]:

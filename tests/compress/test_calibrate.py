@@ -11,10 +11,11 @@ import torch
 from scenes import ball_points, ring, small_model
 
 from hyrfpack.compress.calibrate import MAX_CORRECTION_ROUNDS, calibrate
-from hyrfpack.compress.correction import PREDICTION_TOLERANCE_RATIO, CorrectionFactor
+from hyrfpack.compress.correction import PREDICTION_TOLERANCE_RATIO, CorrectionFactor, SensitivityCorrection
 from hyrfpack.compress.part_errors import (
     COLOR_SECTIONS,
     QUANTIZED_PARTS,
+    ErrorMeasurement,
     decode_changed,
     predict_errors,
 )
@@ -191,6 +192,17 @@ def test_the_correction_stays_finite_for_constant_errors(ratio):
     for _ in range(MAX_CORRECTION_ROUNDS):
         factor.update(ratio)
         assert np.isfinite(factor.value) and factor.value >= 0
+
+
+@pytest.mark.parametrize(
+    ("ratio", "part", "converges"), [(0.6, POSITIONS, True), (0.4, POSITIONS, False), (0.6, COLORS, False)]
+)
+def test_positions_may_have_half_of_their_predicted_error(ratio, part, converges):
+    """Their steps are powers of two, so a smaller factor may give several times the error."""
+    correction = SensitivityCorrection(Sensitivity(*np.ones((5, 3)), {}), [(part,)])
+    correction.update({(part,): ErrorMeasurement(ratio, 1.0)}, min_error=0.0)
+
+    assert (not correction.remaining) == converges
 
 
 @pytest.mark.parametrize("part", QUANTIZED_PARTS[1:], ids="".join)
