@@ -24,9 +24,9 @@ COMPARISON_DRAWN_GAUSSIANS = 1_000_000
 # Half of the views are at cameras and half between them.
 MIN_COMPARISON_VIEWS = 6
 MAX_COMPARISON_VIEWS = 10
-# An error in two views that differs from its prediction by more than this factor is not measured in the others: the
-# prediction is then corrected by far more than the errors of views differ.
-MAX_ROUGH_ERROR_RATIO = 4.0
+# If the errors in two views are both higher, or both lower, than their prediction by more than this factor, the others
+# are not measured: the prediction is then corrected by far more than the errors of views differ.
+MAX_ROUGH_ERROR_RATIO = 16.0
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ class ReferenceRenders:
             decoded: the result of `model.decode()`, if it is known already.
             colors: the colours (N, 3) of the model's Gaussians in each view, if they are known: those of the references
                 if only shapes and opacities differ.
-            predicted: the predicted error. If it is more than MAX_ROUGH_ERROR_RATIO times, or less than this part of,
-                the error in a view at a camera and a view between cameras, the result is the mean of these two.
+            predicted: the predicted error. If the errors in a view at a camera and in one between cameras are both more
+                than MAX_ROUGH_ERROR_RATIO times higher or both that much lower, the result is the one nearer to it.
         """
         decoded = model.decode() if decoded is None else decoded
         count = len(self.views)
@@ -107,9 +107,11 @@ class ReferenceRenders:
         if predicted is None:
             return float(np.median(measure(range(count))))
         errors = measure(rough)
-        if predicted / MAX_ROUGH_ERROR_RATIO <= np.median(errors) <= predicted * MAX_ROUGH_ERROR_RATIO:
-            errors += measure([index for index in range(count) if index not in rough])
-        return float(np.median(errors))
+        if min(errors) > predicted * MAX_ROUGH_ERROR_RATIO:
+            return min(errors)
+        if max(errors) < predicted / MAX_ROUGH_ERROR_RATIO:
+            return max(errors)
+        return float(np.median(errors + measure([index for index in range(count) if index not in rough])))
 
 
 def _map_renders(
