@@ -10,7 +10,7 @@ from typing import Any
 
 from hyrfpack.data.archive import archive_paths_in_errors, is_archive, unpack
 from hyrfpack.data.cache import PictureCache
-from hyrfpack.data.folder import list_photos, list_raw_photos, why_missing
+from hyrfpack.data.folder import explain_missing_path, list_photos, list_raw_photos
 from hyrfpack.data.layouts import LAYOUTS
 from hyrfpack.data.search import find_set
 from hyrfpack.data.unusable import no_photos_error, raise_if_single_photo
@@ -126,8 +126,8 @@ def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], hel
 
 def _open_folder(given: Path, notes: list[str]) -> Path:
     """Return the user's folder; unpack an archive, add a note, and return the folder of its files."""
-    if (why := why_missing(given, "folder")) is not None:
-        raise HyrfDataError(f"{given}: {why}", fix="check the path")
+    if (reason := explain_missing_path(given, "folder")) is not None:
+        raise HyrfDataError(f"{given}: {reason}", fix="check the path")
     if is_archive(given):
         folder = unpack(given)
         notes.append(f"{given.name} was unpacked into {folder} and is reused from there")

@@ -133,8 +133,13 @@ def downscale_factor(name: str) -> int:
     return int(match[1]) if match else 0
 
 
-def why_missing(path: Path, kind: str) -> str | None:
-    """Return why nothing can be read at a path: there is "no such" file or folder, or access is denied; or None."""
+def explain_missing_path(path: Path, kind: str) -> str | None:
+    """Return the reason why nothing can be read at a path; None if there is a file or folder that can be read.
+
+    Args:
+        path: the path.
+        kind: what should be there, such as "folder", for the message.
+    """
     try:
         os.stat(path)
     except PermissionError as error:

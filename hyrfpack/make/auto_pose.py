@@ -1,4 +1,4 @@
-"""Estimate poses into the folder of a training run, for `hyrfpack train --poses`."""
+"""Estimate missing poses before a training run, for `hyrfpack train --poses`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from hyrfpack.make.stage_cache import interruptible
 from hyrfpack.make.stages import SCENE_FOLDER, is_posed
 from hyrfpack.make.state import files_digest
 
-SOURCE_RECORD = "photos.digest"  # in the scene's folder: the digest of the photos that its poses were estimated from
+SOURCE_DIGEST_NAME = (
+    "photos.digest"  # in the scene's folder: the digest of the photos that its poses were estimated from
+)
 _LOG = logging.getLogger(__name__)
 
 
@@ -29,28 +31,32 @@ def auto_pose(
     overwrite: bool = False,
     context: RunContext = RunContext(),  # noqa: B008 - frozen
 ) -> Path:
-    """Estimate the poses of photos into the folder of a training run, unless an earlier call has done so.
+    """Estimate the poses of photos and write the scene into the folder of a training run.
+
+    Poses that an earlier call has estimated from the same photos are reused.
 
     Args:
         photos: a folder of photos, its .zip, or a video.
         run: folder of the run; the scene is written to `scene/` in it.
         images: sub-folder of the photos to use.
-        resume: the run is resumed, so the folder may have a run.
-        overwrite: estimate again if there are poses.
+        resume: the run is resumed, so the folder may already hold a run.
+        overwrite: estimate the poses again if the scene has some.
         context: progress and stop.
 
     Returns:
         The folder of the scene.
 
     Raises:
-        HyrfError: the folder may not or cannot be written, is in use by another call, has a run, or has poses of other
-            photos; or the poses cannot be estimated.
+        HyrfError: the folder may not or cannot be written, is in use by another call, holds a run, or holds poses of
+            other photos; or the poses cannot be estimated.
         KeyboardInterrupt: the estimation was interrupted; the same call resumes it.
     """
     scene, source = run / SCENE_FOLDER, Source.from_path(photos, LoadSettings(images))
     _check_run_folder(source, run, overwrite=True)
     if Path(os.path.realpath(run)).is_relative_to(os.path.realpath(source.path)):
-        raise HyrfError(f"{run}: the run would lie among the photos", fix="name another folder")
+        raise HyrfError(
+            f"{run}: the folder of the run would lie among the photos", fix="choose a folder that is not among them"
+        )
     with exclusive_folder(run):
         _check_run_folder(source, run, overwrite=overwrite or resume)
         _estimate_unless_posed(source, scene, overwrite, context)
@@ -58,28 +64,28 @@ def auto_pose(
 
 
 def _check_run_folder(source: Source, run: Path, *, overwrite: bool) -> None:
-    """Check that the run's folder may be written. Raises HyrfError: it lies among the sources, or has a run."""
+    """Check that the run's folder may be written. Raises HyrfError: it is a folder of the source, or holds a run."""
     for outputs in source.output_rules(overwrite):
         outputs.folder(run, [MODEL_FILE, CHECKPOINT_FILE, METRICS_FILE])
 
 
 def _estimate_unless_posed(source: Source, scene: Path, overwrite: bool, context: RunContext) -> None:
-    """Estimate poses into the folder of a scene, unless it has poses and `overwrite` is not set.
+    """Estimate poses and write them into the folder of a scene, unless it has poses and `overwrite` is not set.
 
     Raises:
         HyrfError: the poses there are of other photos, or the poses cannot be estimated.
     """
     from hyrfpack.poses import estimate_poses
 
-    digest, record = files_digest(source.files(), source.path), scene / SOURCE_RECORD
+    digest, record = files_digest(source.files(), source.path), scene / SOURCE_DIGEST_NAME
     if is_posed(scene) and not overwrite:
         if record.is_file() and record.read_text() != digest:
             raise HyrfError(
                 f"{scene}: these poses were estimated from other photos, or the photos have changed",
-                fix="choose another folder, or estimate them anew with `overwrite=True`",
+                fix="choose another folder, or estimate them again with `overwrite=True`",
             )
         _LOG.info(
-            f"poses are taken from {scene}, where they were estimated before; `overwrite=True` estimates them anew"
+            f"reusing the poses in {scene}, which an earlier call estimated; `overwrite=True` estimates them again"
         )
         return
     with interruptible():

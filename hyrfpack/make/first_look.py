@@ -25,7 +25,7 @@ from hyrfpack.train import Trainer
 _LOG = logging.getLogger(__name__)
 
 MAX_PHOTO_SIZE = 480  # longer side in pixels of the reduced photos
-MIN_REDUCTION_RATIO = 1.5  # exact poses of photos that are at most this many times as large take little longer
+MIN_REDUCTION_RATIO = 1.5  # the exact poses of photos that are less than this many times as large take little longer
 MAX_PHOTOS = 40
 FIRST_LOOK_STEPS = 200
 
@@ -47,27 +47,27 @@ def show_first_look(
         source: folder of photos, or a video.
         folder: folder of intermediate results, replaced, and deleted at the end.
         config: settings of the pose estimation.
-        observer: called after each step with the trainer, whose `kind` is "first look".
+        observer: called with the trainer after each step; the trainer's `kind` is "first look".
         context: device, progress and cache.
     """
     assert callable(context.progress)
-    report = _prefix_events(context.progress)
-    context = replace(context, progress=report)
+    progress = _prefix_events(context.progress)
+    context = replace(context, progress=progress)
     shutil.rmtree(folder, ignore_errors=True)
     try:
         with log_only_errors_of("hyrfpack.poses"):  # the exact estimation logs the same notes again
-            photos = _take_frames(source, folder / "frames", report) if source.is_file() else source
+            photos = _extract_frames(source, folder / "frames", progress) if source.is_file() else source
             if not _reduce_photos(photos, folder / "photos"):
                 return
             _train_coarse_model(folder, config, observer, context)
     except (HyrfError, OSError) as error:
-        _LOG.info(f"there is no first look: {error}")
+        _LOG.info(f"the first look is skipped: {error}")
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _take_frames(video: Path, folder: Path, progress: Progress) -> Path:
-    """Write frames of a video into a new folder, and return it."""
+def _extract_frames(video: Path, folder: Path, progress: Progress) -> Path:
+    """Write the chosen frames of a video into a new folder, and return the folder."""
     from hyrfpack.poses.frames import choose_frames
 
     choose_frames(video, folder, most=MAX_PHOTOS, progress=progress)
@@ -75,17 +75,20 @@ def _take_frames(video: Path, folder: Path, progress: Progress) -> Path:
 
 
 def _reduce_photos(source: Path, folder: Path) -> bool:
-    """Write reduced copies of evenly spaced photos into a new folder; return whether that makes them much smaller."""
+    """Write reduced copies of evenly spaced photos into a new folder, and return whether they were written.
+
+    Nothing is written if the photos are hardly larger than their copies would be.
+    """
     photos = list_photos(source)
     first = first_readable_photo(photos)
     if first is None or max(first.size) < MIN_REDUCTION_RATIO * MAX_PHOTO_SIZE:
         return False
-    chosen = evenly_spaced(photos, MAX_PHOTOS)
-    targets = [folder / path.parent.relative_to(source) / f"{n:04}.jpg" for n, path in enumerate(chosen)]
+    selected = evenly_spaced(photos, MAX_PHOTOS)
+    targets = [folder / path.parent.relative_to(source) / f"{n:04}.jpg" for n, path in enumerate(selected)]
     for parent in {target.parent for target in targets}:
         parent.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(thread_count()) as pool:
-        list(pool.map(_reduce_photo, chosen, targets))
+        list(pool.map(_reduce_photo, selected, targets))
     return True
 
 

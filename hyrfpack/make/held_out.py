@@ -6,8 +6,8 @@ import numpy as np
 
 from hyrfpack.scene import Scene, View
 
-NEAREST_CAMERAS = 4  # a camera is compared with its nearest neighbours
-MAX_WEAK_VIEWS = 2  # up to this number, the mean score depends on which photos are held out
+NEIGHBOUR_CAMERAS = 4
+MAX_UNREPRESENTATIVE_VIEWS = 2  # up to this number, the mean score depends on which photos are held out
 # A held-out PSNR this far below that of the training photos means four times their squared error.
 MAX_PSNR_GAP_DB = 6.0
 
@@ -16,10 +16,10 @@ def choose_inner_view(scene: Scene) -> View:
     """Choose the view that is best surrounded by others; of equally good views, the first by name is chosen.
 
     Each camera is a point with six coordinates: its position, in units of the median distance from cameras to scene
-    points, and its viewing direction. The score of a camera is the mean distance to its NEAREST_CAMERAS nearest others
-    plus the distance to their centre. The first part is large for a camera that is far from all others. The second
-    part is large for a camera at the edge, which has all its neighbours on one side. The camera with the lowest score
-    is chosen.
+    points, and its viewing direction. The score of a camera is the mean distance to its NEIGHBOUR_CAMERAS nearest
+    neighbours plus the distance to their centre. The first part is large for a camera that is far from all others. The
+    second part is large for a camera at the edge, which has all its neighbours on one side. The camera with the lowest
+    score is chosen.
 
     Args:
         scene: a scene with at least two views.
@@ -33,7 +33,7 @@ def choose_inner_view(scene: Scene) -> View:
     for index, others in enumerate(offsets):
         others = np.delete(others, index, axis=0)
         distances = np.linalg.norm(others, axis=1)
-        near = np.argsort(distances, kind="stable")[:NEAREST_CAMERAS]
+        near = np.argsort(distances, kind="stable")[:NEIGHBOUR_CAMERAS]
         scores.append(distances[near].mean() + np.linalg.norm(others[near].mean(axis=0)))
     return views[int(np.argmin(np.round(scores, 9)))]
 
@@ -59,16 +59,15 @@ def score_note(views: int, psnr: float | None, training_psnr: float | None) -> s
     if psnr is None:
         return ""
     reasons = []
-    if views <= MAX_WEAK_VIEWS:
+    if views <= MAX_UNREPRESENTATIVE_VIEWS:
         reasons.append(
             f"only {views} photo{'s were' if views > 1 else ' was'} held out, so that the score depends on "
             f"which {'they are' if views > 1 else 'one it is'}"
         )
     if training_psnr is not None and training_psnr - psnr > MAX_PSNR_GAP_DB:
         reasons.append(
-            f"held-out photos score {training_psnr - psnr:.1f} dB less than those that were trained on "
-            f"({training_psnr:.1f} dB): they show what few other photos show, or their poses are wrong, or there are "
-            "too few photos"
+            f"held-out photos score {training_psnr - psnr:.1f} dB less than training photos ({training_psnr:.1f} dB): "
+            "they show what few other photos show, or their poses are wrong, or there are too few photos"
         )
     if not reasons:
         return ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, perf_counter
@@ -47,9 +47,9 @@ CANDIDATE_PHOTO_SIZES = (1200, 800, 600, 400)  # longer sides in pixels, tried i
 MIN_PROBE_PHOTO_SIZE = 640  # photos are not shrunk below this size in pixels for the first probe
 TRAINED_PACE_RATIO = 0.92  # later steps take this ratio of the probe's time, because more Gaussians are hidden
 # A pass, which renders a view on the CPU and back-propagates through it, is the unit of the work after training.
-VERIFICATION_VIEWS = 12  # packing verifies its result on this number of views
+VERIFICATION_VIEWS = 12  # packing renders as many views to verify its result
 CODING_SECONDS_PER_GAUSSIAN = 1.5e-4
-OVERHEAD_SECONDS = 6.0  # coding and writing a model of any size takes this long
+OVERHEAD_SECONDS = 6.0  # coding and writing a model takes at least this long
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,11 @@ class SceneCost:
     gaussians: int
     requested: Plan = Plan(FULL_STEPS, DEFAULT_MAX_SIZE)
 
-    def scaled_to_pixels(self, pixels: float) -> SceneCost:
-        """Estimate the cost of photos that have `pixels` times as many pixels."""
+    def scaled_by_pixels(self, pixel_ratio: float) -> SceneCost:
+        """Estimate the cost of photos that have `pixel_ratio` times as many pixels."""
         step, per_gaussian, cpu = (
-            pixels * t for t in (self.step_seconds, self.step_seconds_per_gaussian, self.cpu_pass_seconds)
+            pixel_ratio * seconds
+            for seconds in (self.step_seconds, self.step_seconds_per_gaussian, self.cpu_pass_seconds)
         )
         return dataclasses.replace(
             self, step_seconds=step, step_seconds_per_gaussian=per_gaussian, cpu_pass_seconds=cpu
@@ -90,7 +91,7 @@ class SceneCost:
         return TRAINED_PACE_RATIO * steps * step + self.decoding_seconds * min(steps, len(scene.train))
 
     def seconds_after_training(self, scene: Scene, steps: int) -> dict[str, float]:
-        """Estimate the seconds after the last step, by part (`hyrfpack.make.progress.STAGE_PARTS`) or stage."""
+        """Estimate the seconds of the work after the last training step, by part of a stage, see `STAGE_PARTS`."""
         budget = self._budget(scene, steps)
         at_end, at_probe = (self.step_seconds + self.step_seconds_per_gaussian * n for n in (budget, self.gaussians))
         pass_seconds = TRAINED_PACE_RATIO * self.cpu_pass_seconds * at_end / at_probe
@@ -122,7 +123,7 @@ class SceneCost:
 
 def fit_plan_to_minutes(
     path: Path,
-    reading: LoadSettings,
+    load_settings: LoadSettings,
     scene: Scene,
     requested: Plan,
     device: torch.device,
@@ -137,8 +138,8 @@ def fit_plan_to_minutes(
 
     Args:
         path: path of the photos.
-        reading: settings with which they are read.
-        scene: the photos at the size of `reading`.
+        load_settings: settings with which they are read.
+        scene: the photos at the size of `load_settings`.
         requested: the plan without a time limit, which has the target size, number of Gaussians and preset.
         device: device of the training.
         end: time limit by the monotonic clock, in seconds.
@@ -146,60 +147,35 @@ def fit_plan_to_minutes(
         cache: cache of decoded photos.
         reporter: reports progress, and gets the estimates of the plan.
     """
-    draft = QUALITIES["draft"]
     # The pilots that choose a number of steps take as long as the training itself, so the time limit alone chooses it.
     requested = dataclasses.replace(requested, early_stop=False)
     if (remaining := end - monotonic()) <= 0:
-        _LOG.warning(f"no time is left for training: making a draft of {draft.steps} steps")
-        draft_max_size = min(reading.max_size or draft.max_size, draft.max_size)
-        plan = dataclasses.replace(requested, steps=draft.steps, max_size=draft_max_size)
-        reporter.estimates |= estimate_scene_seconds(reading.load(path, draft_max_size), plan, device)
-        return plan
-    sizes = _candidate_sizes(scene, reading.max_size)
-    probed = next((size for size in reversed(sizes) if size >= MIN_PROBE_PHOTO_SIZE), sizes[0])
-    scenes = {reading.max_size: scene}
+        return _plan_draft(path, load_settings, requested, device, reporter)
+    max_probe_seconds = MAX_PROBE_TIME_RATIO * remaining
+    scenes = {load_settings.max_size: scene}
 
-    def at(size: int) -> Scene:
-        return scenes[size] if size in scenes else scenes.setdefault(size, reading.load(path, size))
+    def scene_at(size: int) -> Scene:
+        return scenes[size] if size in scenes else scenes.setdefault(size, load_settings.load(path, size))
 
-    reporter.update(0.0, f"timing training steps on photos of {_longest_side(at(probed))} pixels")
-    cost = first = measure_scene_cost(at(probed), requested, device, seed, cache, MAX_PROBE_TIME_RATIO * remaining)
-    for chosen in sizes:
-        cost = first.scaled_to_pixels(mean_megapixels(at(chosen)) / mean_megapixels(at(probed)))
-        if cost.max_steps_within(at(chosen), end - monotonic()) >= MIN_USEFUL_STEPS:
-            break
-    if chosen != probed:
-        reporter.update(0.5, f"timing training steps on photos of {_longest_side(at(chosen))} pixels")
-        cost = measure_scene_cost(at(chosen), requested, device, seed, cache, MAX_PROBE_TIME_RATIO * remaining)
-    chosen_scene = at(chosen)
-    config = dataclasses.replace(requested, steps=cost.max_steps_within(chosen_scene, end - monotonic())).train_config(
-        seed
-    )
+    def measure_cost_at(size: int, share: float) -> SceneCost:
+        reporter.update(share, f"timing training steps on photos of {_longest_side(scene_at(size))} pixels")
+        return measure_scene_cost(scene_at(size), requested, device, seed, cache, max_probe_seconds)
+
+    sizes = _candidate_sizes(scene, load_settings.max_size)
+    size, cost = _choose_photo_size(sizes, scene_at, measure_cost_at, end)
+    chosen_scene = scene_at(size)
+    max_steps = cost.max_steps_within(chosen_scene, end - monotonic())
+    config = dataclasses.replace(requested, steps=max_steps).train_config(seed)
     decisions = decide(chosen_scene, config, cache, device, part_of_progress(reporter.report_event, 0.6, 1.0))
     assert decisions is not None  # None is only returned if the run is stopped, which nothing does here
+    for reason in decisions.reasons.values():
+        _LOG.info(f"pilot runs: {reason}")
     factor = decisions.config.budget_factor
     if is_budget_open(config) and factor is None:
         factor = 1.0  # the decision stays the same if a few more steps fit
-    for reason in decisions.reasons.values():
-        _LOG.info(f"pilot runs: {reason}")
-    requested = dataclasses.replace(
-        requested, max_size=chosen, budget_factor=factor, exposure=decisions.config.exposure
-    )
+    requested = dataclasses.replace(requested, max_size=size, budget_factor=factor, exposure=decisions.config.exposure)
     cost = dataclasses.replace(cost, requested=requested)
-    remaining = end - monotonic()
-    steps = cost.max_steps_within(chosen_scene, remaining)
-    if steps < draft.steps:
-        steps = draft.steps
-        _LOG.warning(
-            f"the time is short: making a draft of {steps} steps, which takes about "
-            f"{cost.total_seconds(chosen_scene, steps) / 60:.1f} minutes"
-        )
-    else:
-        enough = ", the maximum; the scene will be finished early" if steps == FULL_STEPS else ""
-        _LOG.info(
-            f"{remaining / 60:.1f} minutes are left: {steps:,} steps on photos of "
-            f"{_longest_side(chosen_scene)} pixels{enough}"
-        )
+    steps = _choose_steps(cost, chosen_scene, end - monotonic())
     reporter.estimates |= {
         "pilots": 0.0,
         "training": cost.training_seconds(chosen_scene, steps),
@@ -208,8 +184,65 @@ def fit_plan_to_minutes(
     return dataclasses.replace(requested, steps=steps)
 
 
+def _plan_draft(
+    path: Path, load_settings: LoadSettings, requested: Plan, device: torch.device, reporter: Reporter
+) -> Plan:
+    """Return the plan of a draft for a call without time for training, and estimate how long the draft takes."""
+    draft = QUALITIES["draft"]
+    _LOG.warning(f"no time is left for training: training a draft of {draft.steps} steps")
+    max_size = min(load_settings.max_size or draft.max_size, draft.max_size)
+    plan = dataclasses.replace(requested, steps=draft.steps, max_size=max_size)
+    reporter.estimates |= estimate_scene_seconds(load_settings.load(path, max_size), plan, device)
+    return plan
+
+
+def _choose_photo_size(
+    sizes: Sequence[int],
+    scene_at: Callable[[int], Scene],
+    measure_cost_at: Callable[[int, float], SceneCost],
+    end: float,
+) -> tuple[int, SceneCost]:
+    """Choose the largest size of photos at which MIN_USEFUL_STEPS fit into the time; the smallest if none does.
+
+    The cost is measured at a size of at least MIN_PROBE_PHOTO_SIZE, estimated from that for the other sizes, and
+    measured again at the chosen size.
+
+    Args:
+        sizes: sizes to choose from, the largest first.
+        scene_at: returns the scene with photos of a size.
+        measure_cost_at: measures the cost at a size; its second argument is the share of the stage that is done.
+        end: time limit by the monotonic clock, in seconds.
+
+    Returns:
+        The size, and the cost of the scene at this size.
+    """
+    probed = next((size for size in reversed(sizes) if size >= MIN_PROBE_PHOTO_SIZE), sizes[0])
+    cost = probe = measure_cost_at(probed, 0.0)
+    for size in sizes:
+        cost = probe.scaled_by_pixels(mean_megapixels(scene_at(size)) / mean_megapixels(scene_at(probed)))
+        if cost.max_steps_within(scene_at(size), end - monotonic()) >= MIN_USEFUL_STEPS:
+            break
+    return size, cost if size == probed else measure_cost_at(size, 0.5)
+
+
+def _choose_steps(cost: SceneCost, scene: Scene, remaining: float) -> int:
+    """Return the number of steps that fit into the remaining seconds, at least those of a draft, and log it."""
+    steps = cost.max_steps_within(scene, remaining)
+    if steps < (draft_steps := QUALITIES["draft"].steps):
+        _LOG.warning(
+            f"the time is short: training a draft of {draft_steps} steps, which takes about "
+            f"{cost.total_seconds(scene, draft_steps) / 60:.1f} minutes"
+        )
+        return draft_steps
+    note = ", the maximum; the scene will be finished early" if steps == FULL_STEPS else ""
+    _LOG.info(
+        f"{remaining / 60:.1f} minutes are left: {steps:,} steps on photos of {_longest_side(scene)} pixels{note}"
+    )
+    return steps
+
+
 def measure_scene_cost(
-    scene: Scene, requested: Plan, device: torch.device, seed: int, cache: PictureCache, seconds: float
+    scene: Scene, requested: Plan, device: torch.device, seed: int, cache: PictureCache, max_seconds: float
 ) -> SceneCost:
     """Measure the cost of a scene by a small training run from its first Gaussians to the budget.
 
@@ -219,7 +252,7 @@ def measure_scene_cost(
         device: device of the training.
         seed: random seed.
         cache: cache of decoded photos.
-        seconds: the run stops after this time, but not before it has enough steps for a measurement.
+        max_seconds: the run stops after this time, but not before it has enough steps for a measurement.
     """
     default_config = dataclasses.replace(requested, steps=TrainConfig.steps).train_config(seed)
     budget, _ = budget_for(scene, default_config)
@@ -236,7 +269,7 @@ def measure_scene_cost(
     counts: list[int] = []
     working: list[float] = []
     waiting: list[float] = []
-    end = monotonic() + seconds
+    end = monotonic() + max_seconds
 
     def measure_step(event: StepEvent) -> None:
         waited = trainer.seconds["data"] - sum(waiting)
@@ -245,14 +278,15 @@ def measure_scene_cost(
         counts.append(event.gaussians)
 
     trainer.run(progress=measure_step, stop=lambda: len(working) > 2 * PROBE_WARM_UP_STEPS and monotonic() > end)
-    step, per_gaussian_seconds = _fit_line(counts[PROBE_WARM_UP_STEPS:], working[PROBE_WARM_UP_STEPS:])
+    step_seconds, seconds_per_gaussian = _fit_line(counts[PROBE_WARM_UP_STEPS:], working[PROBE_WARM_UP_STEPS:])
     views = [view.camera for view in evenly_spaced(scene.train, 4)]
     cpu_pass_seconds = _measure_cpu_pass(trainer.model, views)
-    return SceneCost(step, per_gaussian_seconds, statistics.fmean(waiting), cpu_pass_seconds, counts[-1], requested)
+    decoding_seconds = statistics.fmean(waiting)
+    return SceneCost(step_seconds, seconds_per_gaussian, decoding_seconds, cpu_pass_seconds, counts[-1], requested)
 
 
 def _fit_line(counts: Sequence[int], seconds: Sequence[float]) -> tuple[float, float]:
-    """Return (a, b) >= 0 of the line seconds = a + b count through the medians of the first and the last third."""
+    """Fit the line seconds = a + b count through the medians of the first and the last third; return a, b >= 0."""
     third = max(1, len(counts) // 3)
     first, last = slice(0, third), slice(-third, None)
     x0, x1 = (float(np.median(counts[part])) for part in (first, last))
@@ -263,7 +297,7 @@ def _fit_line(counts: Sequence[int], seconds: Sequence[float]) -> tuple[float, f
 
 
 def _measure_cpu_pass(model: HybridModel, cameras: Sequence[Camera]) -> float:
-    """Return the median seconds of a pass on the CPU; the first one, which warms up, does not count."""
+    """Return the median seconds of a pass on the CPU, without the first pass, which warms up."""
     model = model.to("cpu")
     times = []
     for camera in cameras:

@@ -63,11 +63,11 @@ class Quality:
     import_psnr: float
 
     def training_steps(self, pixels: float, device: torch.device) -> int:
-        """Return the training steps on photos of `pixels` pixels; between the two sizes they follow a power law."""
+        """Return the training steps on photos of `pixels` pixels, by a power law between the two sizes."""
         if device.type != "cpu":
             return self.gpu_steps
-        share = math.log(pixels / SMALL_PHOTO_PIXELS) / math.log(LARGE_PHOTO_PIXELS / SMALL_PHOTO_PIXELS)
-        return round(self.steps * (self.large_photo_steps / self.steps) ** min(max(share, 0.0), 1.0))
+        exponent = math.log(pixels / SMALL_PHOTO_PIXELS) / math.log(LARGE_PHOTO_PIXELS / SMALL_PHOTO_PIXELS)
+        return round(self.steps * (self.large_photo_steps / self.steps) ** min(max(exponent, 0.0), 1.0))
 
 
 QUALITIES = {
@@ -93,8 +93,8 @@ QUALITIES = {
 }
 
 
-def find_quality(config: MakeConfig) -> Quality:
-    """Return the settings of the requested quality, "normal" if none is."""
+def requested_quality(config: MakeConfig) -> Quality:
+    """Return the settings of the requested quality, by default those of "normal"."""
     return QUALITIES[config.quality or "normal"]
 
 
@@ -169,24 +169,24 @@ def estimate_seconds(
     Returns:
         Seconds by part of a stage (`hyrfpack.make.progress.STAGE_PARTS`) or by stage.
     """
-    pixels, scoring_passes = size.pixels / 1e6, PASSES_PER_SCORED_VIEW * held_out
-    fixed, per_megapixel = (
+    megapixels, scoring_passes = size.pixels / 1e6, PASSES_PER_SCORED_VIEW * held_out
+    seconds_per_step, seconds_per_megapixel = (
         (CPU_STEP_SECONDS, CPU_STEP_SECONDS_PER_MEGAPIXEL)
         if device.type == "cpu"
         else (0.0, GPU_STEP_SECONDS_PER_MEGAPIXEL)
     )
     pilot_gaussians = usual_budget(size.pixels, size.pixels, BUDGET_REFERENCE_STEPS)
     step_seconds, pilot_step_seconds = (
-        fixed + pixels * per_megapixel * size.mean_step_cost(DensityConfig(), count, count)
+        seconds_per_step + megapixels * seconds_per_megapixel * size.mean_step_cost(DensityConfig(), count, count)
         for count in (gaussians, pilot_gaussians)
     )
     return {
         "pilots": pilot_steps * pilot_step_seconds,
         "training": 2 + plan.steps * step_seconds,
-        "results": 2 + (BACKGROUND_SEARCH_PASSES + scoring_passes) * pixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
+        "results": 2 + (BACKGROUND_SEARCH_PASSES + scoring_passes) * megapixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
         "compression": 3
-        + (count_packing_passes(gaussians) + 3 * plan.finetune_steps) * pixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
-        "scoring": 0.5 + scoring_passes * pixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
+        + (count_packing_passes(gaussians) + 3 * plan.finetune_steps) * megapixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
+        "scoring": 0.5 + scoring_passes * megapixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
         "export": 2.0,
     }
 
@@ -206,7 +206,7 @@ def expected_photo_size(size: tuple[int, int] | None, max_size: int) -> PhotoSiz
 
 
 def estimate_photos_seconds(count: int, size: PhotoSize, plan: Plan, device: torch.device) -> dict[str, float]:
-    """Return `estimate_seconds` and the time for poses, for `count` photos of this size."""
+    """Return `estimate_seconds` and the seconds of the pose estimation, for `count` photos of this size."""
     trained = count - count // 8
     gaussians = usual_budget(size.pixels, trained * size.pixels, plan.steps)
     pilot_steps = max_exposure_pilot_steps(trained, plan.steps) * (plan.steps >= MIN_EXPOSURE_STEPS)

@@ -18,7 +18,7 @@ from hyrfpack.train.provenance import training_provenance
 _LOG = logging.getLogger(__name__)
 
 PREVIEW_FILE = "preview.hyrf"
-_TRAINED_FILE = "preview.raw.hyrf"  # the model before it is compressed
+_UNCOMPRESSED_FILE = "preview.raw.hyrf"
 
 
 def remove_preview(stage_cache: StageCache) -> None:
@@ -39,23 +39,23 @@ def write_preview(stage_cache: StageCache, trainer: Trainer, context: RunContext
         context: context of the call.
 
     Returns:
-        The file; None if it cannot be written, which is logged, or if a further interruption skips it.
+        The path of the file; None if it cannot be written, which is logged, or if a second interruption skips it.
     """
-    target, trained = stage_cache.folder / PREVIEW_FILE, stage_cache.folder / _TRAINED_FILE
-    _LOG.info("stopping: compressing the scene as it is now; a second interruption skips this")
+    target, uncompressed = stage_cache.folder / PREVIEW_FILE, stage_cache.folder / _UNCOMPRESSED_FILE
+    _LOG.info("stopping: compressing a preview of the scene; a second interruption skips it")
     provenance = {"steps": trainer.step, "choices": trainer.choices, **training_provenance(trainer.scene)}
-    # The stop that ended the training does not end the compression, too.
-    compressing = replace(context, progress=stage_cache.reporter.report_event, stop=None)
+    # The stop that ended the training must not end the compression, too.
+    compression_context = replace(context, progress=stage_cache.reporter.report_event, stop=None)
     try:
         trainer.fit_exposure_map()
-        save_model(trainer.model, trained, profile="raw", provenance=provenance)
-        compress_model(trained, target, context=compressing)
+        save_model(trainer.model, uncompressed, profile="raw", provenance=provenance)
+        compress_model(uncompressed, target, context=compression_context)
     except HyrfError as error:
-        _LOG.warning(f"the scene so far cannot be written: {error}")
+        _LOG.warning(f"the preview of the scene cannot be written: {error}")
         return None
     except KeyboardInterrupt:
         return None
     finally:
         with suppress(OSError):
-            trained.unlink(missing_ok=True)
+            uncompressed.unlink(missing_ok=True)
     return target

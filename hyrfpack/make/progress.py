@@ -39,7 +39,8 @@ class Reporter:
         Args:
             stages: their names, in the order in which they run.
             progress: called with `StageEvent`s.
-            stop: returns whether to stop, see `RunContext`. Training asks it by itself, because it saves a checkpoint.
+            stop: returns whether to stop, see `RunContext`. Training calls it by itself, because it saves a checkpoint
+                before it stops.
         """
         self.estimates: dict[str, float] = {}
         self._stages = tuple(stages)
@@ -48,7 +49,7 @@ class Reporter:
         self._call_watcher: Callable[[], None] = lambda: None
         self._part = parts_of(stages[0])[0]
         self._pace = SharePace(monotonic())  # of the current part
-        self._share, self._shown, self._slowdown = 0.0, 0.0, 1.0
+        self._part_share, self._reported_stage_share, self._slowdown = 0.0, 0.0, 1.0
 
     @contextmanager
     def watched_by(self, watcher: Callable[[], None]) -> Iterator[None]:
@@ -59,15 +60,15 @@ class Reporter:
         finally:
             self._call_watcher = lambda: None
 
-    def begin(self, stage: str, *words: str) -> None:
+    def begin(self, stage: str, *descriptions: str) -> None:
         """Report that a stage and its first part begin."""
-        self._shown = 0.0
-        self.begin_part(parts_of(stage)[0], *words)
+        self._reported_stage_share = 0.0
+        self.begin_part(parts_of(stage)[0], *descriptions)
 
-    def begin_part(self, part: str, *words: str) -> None:
+    def begin_part(self, part: str, *descriptions: str) -> None:
         """Report that a part of the current stage begins or is restarted; its pace is measured from now on."""
         self._part, self._pace = part, SharePace(monotonic())
-        self.update(0.0, *words)
+        self.update(0.0, *descriptions)
 
     def skip(self, stage: str, seconds: float) -> None:
         """Record that an earlier call has finished a stage in `seconds`, which shows how fast the machine is."""
@@ -75,12 +76,12 @@ class Reporter:
             forecast = sum(self.estimates.get(part, 0.0) for part in parts_of(stage))
             self._set_slowdown(seconds, forecast)
 
-    def update(self, share: float, *words: str) -> None:
+    def update(self, share: float, *descriptions: str) -> None:
         """Report the progress of the current part.
 
         Args:
             share: share of the part that is done, 0 to 1; 0 if it is unknown.
-            words: descriptions of the current work, the most important first.
+            descriptions: descriptions of the current work, the most important first.
 
         Raises:
             KeyboardInterrupt: the call is to stop, outside of the training.
@@ -88,20 +89,21 @@ class Reporter:
         if self._stop is not None and stage_of(self._part) != "training" and self._stop():
             raise KeyboardInterrupt
         self._call_watcher()
-        self._share = share
+        self._part_share = share
         now = monotonic()
         self._pace.add(share, now)
         stage = stage_of(self._part)
-        index, left = self._stages.index(stage), self._estimate_part_seconds(share, now)
-        self._shown = max(self._shown, self._share_of_stage(share))
-        if left is not None:
-            left += sum(self._forecast(part) for part in self._later_parts())
-        self._progress(StageEvent(stage, index + 1, len(self._stages), self._shown, left, words))
+        number, seconds_left = self._stages.index(stage) + 1, self._estimate_part_seconds(share, now)
+        if seconds_left is not None:
+            seconds_left += sum(self._forecast(part) for part in self._later_parts())
+        self._reported_stage_share = max(self._reported_stage_share, self._share_of_stage(share))
+        event = StageEvent(stage, number, len(self._stages), self._reported_stage_share, seconds_left, descriptions)
+        self._progress(event)
 
     def report_event(self, event: Event) -> None:
         """Report the progress of a call that does the current part; without a share, only its description."""
         if isinstance(event, TaskEvent):
-            self.update(self._share if event.share is None else event.share, str(event))
+            self.update(self._part_share if event.share is None else event.share, str(event))
 
     def _estimate_part_seconds(self, share: float, now: float) -> float | None:
         """Estimate the seconds until the current part is done; None if there is neither a forecast nor a pace."""

@@ -47,12 +47,25 @@ def default_work_folder(output: Path) -> Path:
 
 @dataclass(frozen=True)
 class Request:
-    """The arguments of `make`, with an inspected source. Outputs "." and ".." become full paths."""
+    """The arguments of `make`, with the inspected source.
+
+    An output "." or ".." is replaced by its full path. The other attributes are those of `make_scene`.
+
+    Attributes:
+        source: the inspected source.
+        output: path of the output.
+        work: the work folder.
+        load_settings: settings with which photos are read.
+        config: settings of the call.
+        device: device for training and packing.
+        overwrite: replace an existing output.
+        is_observed: whether an observer watches the training.
+    """
 
     source: Source
     output: Path
     work: Path
-    reading: LoadSettings
+    load_settings: LoadSettings
     config: MakeConfig
     device: torch.device
     overwrite: bool
@@ -71,14 +84,14 @@ class Request:
         return names
 
     @property
-    def makes_folder(self) -> bool:
+    def is_output_folder(self) -> bool:
         """Return whether the output is a folder."""
         return not self._is_model and find_file_kind(self.output) is PLAYER_FOLDER
 
     def check(self) -> None:
         """Check the request. Raises HyrfError: it is impossible, or the output may not or cannot be written."""
         self._check_options()
-        self._check_places()
+        self._check_paths()
         if not self.overwrite and not self.is_output_unchanged(WorkFolderState(self.work)):
             for outputs in self.source.output_rules(overwrite=False):
                 self._check_output(outputs, overwrite=False)
@@ -87,31 +100,54 @@ class Request:
         """Check an existing output before a stage runs again with these inputs.
 
         Raises:
-            HyrfError: an earlier call made the output, and it may not be replaced.
+            HyrfError: an earlier call wrote the output, and it may not be replaced.
         """
         if not self.overwrite and os.path.lexists(self.output) and self.is_output_unchanged(state):
             if state.has_lost_files(stage, inputs):
                 raise HyrfError(
-                    f"{self.output}: an earlier call made this, but the result of its {stage} stage in {self.work} is "
-                    "missing or changed",
-                    fix="make it again with `overwrite=True`, or name another output",
+                    f"{self.output}: an earlier call wrote this output, but the product of its {stage} stage in "
+                    f"{self.work} is missing or changed",
+                    fix="make the scene again with `overwrite=True`, or name another output",
                 )
             raise HyrfError(
-                f"{self.output}: an earlier call made this from another source or with other settings",
-                fix="name another, or replace it with `overwrite=True`",
+                f"{self.output}: an earlier call wrote this output from another source or with other settings",
+                fix="name another output, or replace this one with `overwrite=True`",
             )
 
     def is_output_unchanged(self, state: WorkFolderState) -> bool:
         """Return whether the output exists and its files match the record of the work folder."""
         top = f"{EXPORT_FOLDER}/{self.output.name}"
-        files = state.files("export").items()
-        there = [(self.output / name[len(top) :].lstrip("/"), made) for name, made in files if name.startswith(top)]
-        there = [(path, made) for path, made in there if os.path.lexists(path)]
-        return bool(there) and all(file_digest(path) == made for path, made in there)
+        recorded = {
+            self.output / name[len(top) :].lstrip("/"): digest
+            for name, digest in state.files("export").items()
+            if name.startswith(top)
+        }
+        existing = {path: digest for path, digest in recorded.items() if os.path.lexists(path)}
+        return bool(existing) and all(file_digest(path) == digest for path, digest in existing.items())
 
     def _check_options(self) -> None:
         """Reject options that exclude each other or do not fit the source."""
+        self._check_output_format()
+        self._check_settings_fit_source()
+        if self.config.target_bytes is not None and self.config.max_gaussians is not None:
+            raise HyrfError(
+                "a target size and a number of Gaussians each decide how large the model is",
+                fix="give one of them (`target_bytes` or `max_gaussians`)",
+            )
+        self._check_target()
         source = self.source
+        if source.kind == "photos" and not list_photos(source.path):
+            raise HyrfDataError(
+                f"{source.path}: there are no photos in this folder", fix="name a folder that holds some"
+            )
+        if source.scene is None and self.config.test_every == 1:  # photos with poses are checked when they are read
+            raise HyrfDataError(
+                f"{source.path}: each photo would be held out, and none is left to train on",
+                fix="hold out fewer with `test_every` (0 holds out none)",
+            )
+
+    def _check_output_format(self) -> None:
+        """Reject an output format that cannot be written from the source."""
         if not self._is_model:
             endings = (".hyrf", *(ending for ending in EXPORT_ENDINGS if ending != TRANSFORMS_JSON.ending))
             kind = find_file_kind(self.output, endings=endings)
@@ -122,35 +158,26 @@ class Request:
                     f"{suggest_command('export', 'MODEL', '-o', self.output)} with `data`",
                 )
             check_request(kind, self.output, ExportConfig())
-        elif source.kind == "model":
+        elif self.source.kind == "model":
             raise HyrfError(
-                f"{source.path}: this is a .hyrf file already", fix="make it smaller with 'hyrfpack compress'"
+                f"{self.source.path}: this is a .hyrf file already", fix="make it smaller with 'hyrfpack compress'"
             )
+
+    def _check_settings_fit_source(self) -> None:
+        """Reject settings that have no effect on this kind of source."""
+        source = self.source
         if source.kind in ("model", "splats"):
             given = [name for name in _PHOTO_SETTINGS if getattr(self.config, name) != getattr(MakeConfig, name)]
             given += ["observer"] if self.is_observed else []
             if given:
                 raise HyrfError(
-                    f"{source.path}: this is no set of photos, but settings for photos were given",
+                    f"{source.path}: this is not a set of photos, but settings for photos were given",
                     fix="leave out " + " and ".join(f"`{name}`" for name in given),
                 )
         if source.kind == "model":
             for name in ("quality", "seed"):
                 if getattr(self.config, name) != getattr(MakeConfig, name):
                     raise HyrfError(f"{source.path}: a model is exported as it is", fix=f"leave out `{name}`")
-        if self.config.target_bytes is not None and self.config.max_gaussians is not None:
-            raise HyrfError(
-                "a target size and a number of Gaussians each decide how large the model is",
-                fix="give one of them (`target_bytes` or `max_gaussians`)",
-            )
-        self._check_target()
-        if source.kind == "photos" and not list_photos(source.path):
-            raise HyrfDataError(f"{source.path}: there is no photo in this folder", fix="name one that has some")
-        if source.scene is None and self.config.test_every == 1:  # with poses, reading the photos says so
-            raise HyrfDataError(
-                f"{source.path}: each photo would be held out, and none is left to train on",
-                fix="hold out fewer with `test_every` (0 holds out none)",
-            )
 
     def _check_target(self) -> None:
         """Reject a target size that no file of these photos can have; photos without poses get a weaker check."""
@@ -162,17 +189,19 @@ class Request:
             config = TrainConfig(preset=self.config.preset, target_bytes=self.config.target_bytes)
             check_target(self.source.scene, config)
 
-    def _check_places(self) -> None:
+    def _check_paths(self) -> None:
         """Reject an output or a work folder that may not be written, whether or not it exists."""
         for outputs in self.source.output_rules(overwrite=True):
             self._check_output(outputs, overwrite=True)
             outputs.folder(self.work, [RECORD_NAME])
         work, output = (Path(os.path.realpath(path)) for path in (self.work, self.output))
         if self.source.kind == "photos" and work.is_relative_to(os.path.realpath(self.source.path)):
-            raise HyrfError(f"{self.work}: the work folder would lie among the photos", fix="name another with `work`")
+            raise HyrfError(
+                f"{self.work}: the work folder would lie among the photos", fix="name another folder with `work`"
+            )
         if output.is_relative_to(work) or work.is_relative_to(output):
             raise HyrfError(
-                f"{self.output}: the output and the work folder {self.work} lie in each other",
+                f"{self.output}: this output and the work folder {self.work} may not contain each other",
                 fix="name another folder with `work`",
             )
 
@@ -180,9 +209,9 @@ class Request:
         """Check the output by one set of rules."""
         if self._is_model:
             outputs.file(self.output, ".hyrf")
-        elif self.makes_folder:
+        elif self.is_output_folder:
             model = self.source.path if self.source.kind == "model" else self.work / PACKED_MODEL
-            # This comes first and names existing files of a player; to the other check its poster is a photo.
+            # This check comes first, because the next one would take the poster of an existing player for a photo.
             check_folder(self.output, [model], [self.source.scene], overwrite=overwrite, is_gallery=False)
             outputs.folder(self.output, [])
         else:

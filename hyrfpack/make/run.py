@@ -27,7 +27,7 @@ from hyrfpack.make.plan import (
     estimate_photos_seconds,
     estimate_scene_seconds,
     expected_photo_size,
-    find_quality,
+    requested_quality,
 )
 from hyrfpack.make.preview import remove_preview
 from hyrfpack.make.progress import Reporter
@@ -152,22 +152,23 @@ def make_observed_scene(
     observing: AbstractContextManager[Callable[[Trainer], None] | None] | None = None,
     context: RunContext = RunContext(),  # noqa: B008 - frozen
 ) -> MakeResult:
-    """Make a scene like `make_scene`, with an observer that exists during the work only.
+    """Make a scene like `make_scene`, with an observer that exists only while the stages run.
 
-    `observing` is entered when all arguments are checked and yields the observer; None for none. The other arguments,
-    the result and the errors are those of `make_scene`.
+    The context `observing` is entered after all arguments are checked, and yields the observer; None for no observer.
+    The other arguments, the result and the errors are those of `make_scene`.
     """
     config = MakeConfig() if config is None else config
     check_type("config", config, MakeConfig)
-    began, max_size = monotonic(), find_quality(config).max_size if config.max_size is None else config.max_size
-    reading = LoadSettings(config.images, max_size, config.test_every)
+    start_seconds = monotonic()
+    max_size = requested_quality(config).max_size if config.max_size is None else config.max_size
+    load_settings = LoadSettings(config.images, max_size, config.test_every)
     with interruptible():
         try:
             request = Request(
-                source=Source.from_path(photos, reading),
+                source=Source.from_path(photos, load_settings),
                 output=Path(output),
                 work=default_work_folder(Path(output)) if work is None else Path(work),
-                reading=reading,
+                load_settings=load_settings,
                 config=config,
                 device=context.choose_device(),
                 overwrite=overwrite,
@@ -176,11 +177,11 @@ def make_observed_scene(
             request.check()
             with (
                 exclusive_folder(request.work, "another folder with `work`"),
-                exclusive_folder(request.output) if request.makes_folder else nullcontext(),
+                exclusive_folder(request.output) if request.is_output_folder else nullcontext(),
                 observing or nullcontext() as observer,
             ):
                 with context.open_progress(interruptible=False) as progress:
-                    return _Pipeline(request, observer, began, context, progress).run()
+                    return _Pipeline(request, observer, start_seconds, context, progress).run()
         except Stopped:
             raise
         except KeyboardInterrupt as error:  # interrupted before or between the stages
@@ -194,7 +195,7 @@ class _Pipeline:
         self,
         request: Request,
         observer: Callable[[Trainer], None] | None,
-        began: float,
+        start_seconds: float,
         context: RunContext,
         progress: Progress,
     ) -> None:
@@ -203,14 +204,14 @@ class _Pipeline:
         Args:
             request: the checked arguments of the call.
             observer: observer of the training.
-            began: start of the call by the monotonic clock, in seconds.
+            start_seconds: start of the call by the monotonic clock.
             context: context of the call.
             progress: function that gets the progress of all stages.
         """
         self.request = request
         self.observer = observer
         self.source = request.source
-        self.began = began
+        self.start_seconds = start_seconds
         self.reporter = Reporter(request.stages, progress, context.stop)
         self.owns_cache = context.cache is None
         self.cache = context.cache or PictureCache()
@@ -224,7 +225,7 @@ class _Pipeline:
             return self._finish(self.source.path, scene=None)
         if kind == "splats":
             config = self.request.config
-            target = find_quality(config).import_psnr
+            target = requested_quality(config).import_psnr
             facts = stages.run_import_stage(self.stage_cache, self.source.path, target, config.seed, self.context)
             return self._finish(self.stage_cache.folder / stages.PACKED_MODEL, scene=None, imported=facts)
         return self._make_from_photos()
@@ -232,18 +233,16 @@ class _Pipeline:
     def _make_from_photos(self) -> MakeResult:
         """Run all stages for photos with or without poses."""
         request, stage_cache, poses = self.request, self.stage_cache, {}
-        path, reading, scene = self.source.path, request.reading, self.source.scene
+        path, load_settings, scene = self.source.path, request.load_settings, self.source.scene
         if scene is None:
             poses = self._estimate_poses()
-            path, reading = (
-                stage_cache.folder / stages.SCENE_FOLDER,
-                LoadSettings(None, reading.max_size, reading.test_every),
-            )
-            scene = reading.load(path)
+            path = stage_cache.folder / stages.SCENE_FOLDER
+            load_settings = replace(load_settings, images=None)
+            scene = load_settings.load(path)
         else:
             for sentence in scene.notes:
                 _LOG.info(sentence)
-        plan, scene = self._decide_plan(path, reading, scene)
+        plan, scene = self._decide_plan(path, load_settings, scene)
         if request.config.minutes is None or "measurement" in stage_cache.kept:
             self.reporter.estimates |= estimate_scene_seconds(scene, plan, request.device)
         training = stages.run_training_stage(
@@ -260,7 +259,7 @@ class _Pipeline:
         request, source = self.request, self.source
         photos = list_photos(source.path) if source.kind == "photos" else []
         facts = first_readable_photo(photos)
-        size = expected_photo_size(facts.size if facts else None, request.reading.max_size)
+        size = expected_photo_size(facts.size if facts else None, request.load_settings.max_size)
         plan, count = self._requested_plan(size), len(photos) or ASSUMED_VIDEO_PHOTOS
         estimates = estimate_photos_seconds(count, size, plan, request.device)
         if request.config.minutes is not None:
@@ -278,30 +277,30 @@ class _Pipeline:
 
     def _requested_plan(self, size: PhotoSize) -> Plan:
         """Return the plan that the quality and the other arguments request for photos of this size."""
-        request, quality = self.request, find_quality(self.request.config)
+        request, quality = self.request, requested_quality(self.request.config)
         return Plan(
             quality.training_steps(size.pixels, request.device),
-            request.reading.max_size,
+            request.load_settings.max_size,
             quality.finetune_steps,
             request.config.target_bytes,
             request.config.max_gaussians,
             request.config.preset,
         )
 
-    def _decide_plan(self, path: Path, reading: LoadSettings, scene: Scene) -> tuple[Plan, Scene]:
-        """Return the requested plan or the one that fits the minutes, and the scene at the plan's photo size."""
+    def _decide_plan(self, path: Path, load_settings: LoadSettings, scene: Scene) -> tuple[Plan, Scene]:
+        """Return the plan, which fits into a time limit if there is one, and the scene at the plan's size of photos."""
         request, requested = self.request, self._requested_plan(PhotoSize.of_views(scene.views))
         if request.config.minutes is None:
             return requested, scene
-        end = self.began + 60 * request.config.minutes
+        end = self.start_seconds + 60 * request.config.minutes
         left = max(0.0, end - monotonic())
-        measuring = MEASUREMENT_TIME_RATIO * left
-        self.reporter.estimates |= {"measurement": measuring, "training": left - measuring}
+        measurement_seconds = MEASUREMENT_TIME_RATIO * left
+        self.reporter.estimates |= {"measurement": measurement_seconds, "training": left - measurement_seconds}
 
         def execute(resuming: bool) -> tuple[dict[str, Any], list[str]]:
             plan = fit_plan_to_minutes(
                 path,
-                reading,
+                load_settings,
                 scene,
                 replace(requested, finetune_steps=0),
                 request.device,
@@ -315,7 +314,7 @@ class _Pipeline:
         inputs = {
             "photos and poses": self._scene_digest(scene),
             "minutes": request.config.minutes,
-            "size of photos": reading.max_size,
+            "size of photos": load_settings.max_size,
             "seed": request.config.seed,
             "target size": request.config.target_bytes,
             "number of Gaussians": request.config.max_gaussians,
@@ -328,7 +327,9 @@ class _Pipeline:
         plan = Plan(**self.stage_cache.run_stage("measurement", inputs, execute)).with_target_bytes(
             request.config.target_bytes
         )
-        return plan, scene if plan.max_size == reading.max_size else reading.load(path, plan.max_size)
+        if plan.max_size != load_settings.max_size:
+            scene = load_settings.load(path, plan.max_size)
+        return plan, scene
 
     def _finish(
         self,
@@ -343,11 +344,10 @@ class _Pipeline:
         request, stage_cache = self.request, self.stage_cache
         scores = {"views": 0} if scene is None else stages.run_scoring_stage(stage_cache, scene, request.device)
         exported, product = stages.run_export_stage(
-            stage_cache, model, request.output.name, scene, is_player=request.makes_folder
+            stage_cache, model, request.output.name, scene, is_player=request.is_output_folder
         )
-        output = stages.copy_to_output(
-            product, request.output, overwrite=request.overwrite
-        )  # last, so that an existing output means a finished call
+        # The output is copied last, so that an existing output means a finished call.
+        output = stages.copy_to_output(product, request.output, overwrite=request.overwrite)
         return MakeResult(
             output=output,
             bytes=exported["bytes"],

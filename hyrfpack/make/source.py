@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hyrfpack.data import load_scene
 from hyrfpack.data.archive import is_archive, unpack
-from hyrfpack.data.folder import list_photos, why_missing
+from hyrfpack.data.folder import explain_missing_path, list_photos
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
 from hyrfpack.make.held_out import choose_inner_view
 from hyrfpack.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs, StrPath
@@ -64,41 +64,43 @@ class Source:
     archive: Path | None = None
 
     @classmethod
-    def from_path(cls, path: StrPath, reading: LoadSettings) -> Source:
+    def from_path(cls, path: StrPath, load_settings: LoadSettings) -> Source:
         """Determine the kind of source at a path, and load photos that have poses.
 
         Raises:
-            HyrfDataError: no scene can be made from it.
+            HyrfDataError: no scene can be made from this path.
         """
         path = Path(path)
-        if (why := why_missing(path, "file or folder")) is not None:
-            raise HyrfDataError(f"{path}: {why}", fix="check the path")
+        if (reason := explain_missing_path(path, "file or folder")) is not None:
+            raise HyrfDataError(f"{path}: {reason}", fix="check the path")
         ending = path.suffix.lower()
         if path.is_file() and (ending == ".hyrf" or is_splats(path)):
             return cls(path, "model" if ending == ".hyrf" else "splats")
         if path.is_file() and not (is_archive(path) or ending in VIDEO_SUFFIXES):
-            what = "this is one photo" if ending in PICTURE_SUFFIXES else "nothing can be made of this file"
+            what = "this is one photo" if ending in PICTURE_SUFFIXES else "no scene can be made from this kind of file"
             raise HyrfDataError(
                 f"{path}: {what}",
                 fix="name a folder of photos, its .zip, a video, a .hyrf file, or splats of another program",
             )
         try:
-            return cls(path, "scene", reading.load(path))
+            return cls(path, "scene", load_settings.load(path))
         except HyrfNoPosesError:
             if ending in VIDEO_SUFFIXES and path.is_file():
                 return cls(path, "video")
             if is_sog_folder(path):
                 return cls(path, "splats")
             archive, folder = (path, unpack(path)) if is_archive(path) else (None, path)
-            return cls(folder / (reading.images or ""), "photos", archive=archive)
+            return cls(folder / (load_settings.images or ""), "photos", archive=archive)
         except HyrfDataError:
             names = _list_names(path)
             videos = [name for name in names or () if Path(name).suffix.lower() in VIDEO_SUFFIXES]
             if videos and not list_photos(path):
-                problem = f"{path}: there are no photos in this folder, but {videos[0]}"
-                raise HyrfDataError(problem, fix="name the video") from None
+                problem = f"{path}: there are no photos in this folder, but the video {videos[0]}"
+                raise HyrfDataError(problem, fix="name the video itself") from None
             if names == []:
-                raise HyrfDataError(f"{path}: the folder is empty", fix="name the one that holds the photos") from None
+                raise HyrfDataError(
+                    f"{path}: the folder is empty", fix="name the folder that holds the photos"
+                ) from None
             raise
 
     def files(self) -> list[Path]:
@@ -119,7 +121,7 @@ class Source:
 
 
 def _list_names(folder: Path) -> list[str] | None:
-    """Return the sorted names of what is in a folder; None if the path is no folder or cannot be listed."""
+    """Return the sorted names of the entries of a folder; None if the path is not a folder or cannot be listed."""
     try:
         return sorted(os.listdir(folder))
     except OSError:

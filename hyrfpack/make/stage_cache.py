@@ -35,7 +35,7 @@ class Stopped(KeyboardInterrupt):
 
     Attributes:
         stage: name of the interrupted stage.
-        preview: file with the scene as far as it is trained; None if there is none.
+        preview: file with a preview of the unfinished scene; None if there is none.
     """
 
     def __init__(self, stage: str, preview: Path | None = None) -> None:
@@ -124,24 +124,34 @@ class StageCache:
             self.state.add_seconds(name, clock.unrecorded_seconds())
             raise Stopped(name, getattr(error, "preview", None)) from error
         except HyrfError as error:
-            kept = self._describe_kept_products(name, clock)
-            raise error.with_text(f"{name} failed: {error.problem}", f"{error.fix}{kept}") from error
+            self._record_failure(name, clock)
+            advice = f"{error.fix}{self._describe_kept_products(name)}"
+            raise error.with_text(f"{name} failed: {error.problem}", advice) from error
         self.state.finish(name, files, facts, clock.unrecorded_seconds())
         self.seconds[name] = self.state.seconds(name)
         return facts
 
-    def _describe_kept_products(self, name: str, clock: _StageClock) -> str:
-        """Return the end of the message about a failed stage; remove its record if it wrote nothing."""
-        product = self.folder / PRODUCT_NAMES[name] if name in PRODUCT_NAMES else None
-        has_product = product is not None and _has_files(product)
-        try:
-            if not has_product:
-                self.state.forget(name)
-            else:
+    def _record_failure(self, name: str, clock: _StageClock) -> None:
+        """Record the time of a failed stage, or remove its record and its empty product if it wrote no file."""
+        with suppress(HyrfError):  # the user needs to see the failure of the stage instead
+            if self._has_product(name):
                 self.state.add_seconds(name, clock.unrecorded_seconds())
-        except HyrfError:  # the user needs to see the failure of the stage instead
-            pass
-        return f"; what is finished is kept in {self.folder}" if has_product or self.state.has_finished else ""
+            else:
+                if name in PRODUCT_NAMES:
+                    shutil.rmtree(self.folder / PRODUCT_NAMES[name], ignore_errors=True)
+                self.state.forget(name)
+
+    def _has_product(self, name: str) -> bool:
+        """Return whether a stage has written a file, or files into a folder."""
+        if name not in PRODUCT_NAMES:
+            return False
+        product = self.folder / PRODUCT_NAMES[name]
+        return any(path.is_file() for path in product.rglob("*")) if product.is_dir() else product.exists()
+
+    def _describe_kept_products(self, name: str) -> str:
+        """Return the end of the message about a failed stage, which says where finished work is kept; "" if nowhere."""
+        has_products = self._has_product(name) or self.state.has_finished
+        return f"; finished work is kept in {self.folder}" if has_products else ""
 
 
 class _StageClock:
@@ -155,20 +165,11 @@ class _StageClock:
         return monotonic() - self._since
 
     def record(self) -> None:
-        """Record the time so far, unless the last record is younger than MIN_RECORD_SECONDS."""
+        """Record the time so far, unless the last record is less than MIN_RECORD_SECONDS old."""
         if self.unrecorded_seconds() >= MIN_RECORD_SECONDS:
             with suppress(HyrfError):  # a full disk ends the stage when its product is written, not here
                 self._state.add_seconds(self._stage, self.unrecorded_seconds())
             self._since = monotonic()
-
-
-def _has_files(product: Path) -> bool:
-    """Return whether a product is a file or a folder with files; a folder without files is removed."""
-    if product.is_dir():
-        if any(path.is_file() for path in product.rglob("*")):
-            return True
-        shutil.rmtree(product, ignore_errors=True)
-    return product.exists()
 
 
 def _remove_product(path: Path) -> None:
@@ -181,7 +182,7 @@ def _remove_product(path: Path) -> None:
     except OSError as error:
         raise HyrfError(
             f"{path}: the results of an earlier call cannot be deleted ({error.strerror})",
-            fix="delete this path yourself",
+            fix="delete it yourself",
         ) from error
 
 

@@ -49,7 +49,7 @@ SCENE_FOLDER = PRODUCT_NAMES["poses"]
 RUN_FOLDER = PRODUCT_NAMES["training"]
 PACKED_MODEL = PRODUCT_NAMES["compression"]
 EXPORT_FOLDER = PRODUCT_NAMES["export"]
-FIRST_LOOK_FOLDER = "first_look"  # deleted as soon as the first look was shown
+FIRST_LOOK_FOLDER = "first_look"  # deleted when the first look ends
 FIXED_SETTINGS = ("target_bytes", "budget_factor", "exposure")  # a training run that was begun keeps these settings
 POSES_REPORT_NAME = "poses.json"  # `hyrfpack.estimate_poses` writes its report into the scene's folder
 
@@ -70,7 +70,7 @@ def run_pose_stage(
     observer: Callable[[Trainer], None] | None,
     context: RunContext,
 ) -> dict[str, Any]:
-    """Estimate poses into `scene/`; return the report of `hyrfpack.estimate_poses`.
+    """Estimate poses and write them into `scene/`; return the report of `hyrfpack.estimate_poses`.
 
     An observer gets a first look before the estimation, see `show_first_look`.
     """
@@ -83,7 +83,7 @@ def run_pose_stage(
             if observer is not None:
                 show_first_look(photos, stage_cache.folder / FIRST_LOOK_FOLDER, config, observer, context)
             estimate_poses(photos, scene, config, context=context)
-        shutil.rmtree(scene / ".poses", ignore_errors=True)  # products in progress stay if a call is killed at its end
+        shutil.rmtree(scene / ".poses", ignore_errors=True)  # a call that was killed at its end leaves these
         written = sorted(path for path in scene.rglob("*") if path.is_file())
         report = json.loads((scene / POSES_REPORT_NAME).read_bytes())
         return report, [path.relative_to(stage_cache.folder).as_posix() for path in written]
@@ -98,13 +98,13 @@ def run_pose_stage(
 def run_training_stage(
     stage_cache: StageCache,
     scene: Scene,
-    data: str,
+    scene_digest: str,
     plan: Plan,
     seed: int,
     observer: Callable[[Trainer], None] | None,
     context: RunContext,
 ) -> dict[str, Any]:
-    """Train into `run/`; return the numbers of steps and Gaussians, the decisions made, and other facts.
+    """Train a model and write it into `run/`; return the numbers of steps and Gaussians, the decisions and other facts.
 
     A training run that was begun keeps its target size and what was decided from it. So a call with another target size
     does not train again.
@@ -112,13 +112,13 @@ def run_training_stage(
     config = plan.train_config(seed)
     run = stage_cache.folder / RUN_FOLDER
     settings = {name: value for name, value in config.to_dict().items() if name not in FIXED_SETTINGS}
-    inputs = {"photos and poses": data, "settings": settings, **_split_inputs(scene)}
+    inputs = {"photos and poses": scene_digest, "settings": settings, **_split_inputs(scene)}
     if stage_cache.state.is_under_way("training", inputs):
         config = replace(config, **stage_cache.state.fixed("training"))
     if config.target_bytes != plan.target_bytes:
-        before = "without a target size" if config.target_bytes is None else f"for {config.target_bytes:,} bytes"
+        target = "without a target size" if config.target_bytes is None else f"for {config.target_bytes:,} bytes"
         _LOG.info(
-            f"the trained model is kept: it was trained {before}, and only the compression is repeated; name another "
+            f"the trained model is kept: it was trained {target}, and only the compression is repeated; name another "
             "work folder (`work`) to train it again"
         )
 
@@ -127,18 +127,18 @@ def run_training_stage(
             at_most = "at most " if measures_length(scene, config) else ""
             _LOG.info(
                 f"training: {at_most}{format_count(plan.steps, 'step')} on {format_count(len(scene.train), 'photo')}, "
-                f"{len(scene.test)} held out; "
-                f"on {describe_device(context.choose_device())}"
+                f"{len(scene.test)} held out, on {describe_device(context.choose_device())}"
             )
             resume = resuming and is_begun(run)
             if not resume:
-                remove_preview(stage_cache)  # of photos or settings that have changed
+                remove_preview(stage_cache)  # it shows other photos or settings
             progress = _TrainingProgress(stage_cache.reporter).report_event
             trainers: list[Trainer] = []
 
             def observe(trainer: Trainer) -> None:
                 # A finished trainer is not kept, so that its memory is free while results are written.
-                is_main_run = trainer.kind != "pilot run"  # Pilots are short, and without the validation photos.
+                # No preview is written of a pilot run, which is short and lacks the validation photos.
+                is_main_run = trainer.kind != "pilot run"
                 trainers[:] = [trainer] if is_main_run and trainer.step < trainer.steps else []
                 if observer is not None:
                     observer(trainer)
@@ -156,7 +156,7 @@ def run_training_stage(
             if not trained.complete:
                 raise Stopped("training", write_preview(stage_cache, trainers[-1], context) if trainers else None)
             if not (run / METRICS_FILE).is_file():  # the disk was full; the next call writes them
-                raise HyrfError(trained.missing, fix="run it again, which writes what is missing")
+                raise HyrfError(trained.missing, fix="run the same command again, which writes what is missing")
         metrics = json.loads((run / METRICS_FILE).read_bytes())
         facts = {key: metrics[key] for key in ("gaussians", "bytes", "choices", "device")}
         provenance = describe_file(run / MODEL_FILE)["provenance"]
@@ -218,7 +218,7 @@ class _TrainingProgress:
 
 
 def run_compression_stage(stage_cache: StageCache, scene: Scene, plan: Plan, context: RunContext) -> dict[str, Any]:
-    """Compress into `model.hyrf`; return its size in bytes, the number of Gaussians, and the result of the search."""
+    """Write the compressed model to `model.hyrf`; return its bytes, its Gaussians and the result of the search."""
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
         source, target = stage_cache.folder / RUN_FOLDER / MODEL_FILE, stage_cache.folder / PACKED_MODEL
@@ -226,12 +226,10 @@ def run_compression_stage(stage_cache: StageCache, scene: Scene, plan: Plan, con
             config = CompressConfig(finetune_steps=plan.finetune_steps or None, target_bytes=plan.target_bytes)
             report = compress_model(source, target, config, data=scene, context=context)
         except HyrfSizeError as error:
-            advice = ", or name another work folder (`work`) to train a smaller model for this size"
-            raise HyrfError(
-                f"the trained model does not fit into {plan.target_bytes:,} bytes",
-                fix=f"ask for {error.min_bytes:,} bytes or more "
-                f"(`target_bytes`){advice if trained_target_bytes(stage_cache) != plan.target_bytes else ''}",
-            ) from error
+            fix = f"ask for {error.min_bytes:,} bytes or more (`target_bytes`)"
+            if trained_target_bytes(stage_cache) != plan.target_bytes:
+                fix += ", or name another work folder (`work`) to train a smaller model for this size"
+            raise HyrfError(f"the trained model does not fit into {plan.target_bytes:,} bytes", fix=fix) from error
         return {"bytes": report.bytes_after, "gaussians": report.gaussians, "found": report.found}, [PACKED_MODEL]
 
     cameras = "photos" if plan.finetune_steps else "cameras"  # only fine-tuning reads the photos themselves
@@ -284,8 +282,8 @@ def run_export_stage(
                 target.mkdir(parents=True, exist_ok=True)
             # A player is named after its source by default, and that is model.hyrf in every work folder.
             config = ExportConfig(title=name if is_player else None)
-            made = export_model(model, target, config, data=scene, context=context)
-            report = {**asdict(made), "file": name, "chosen_by": {}}
+            exported = export_model(model, target, config, data=scene, context=context)
+            report = {**asdict(exported), "file": name, "chosen_by": {}}
         files = sorted(target.rglob("*")) if target.is_dir() else [target]
         return report, [path.relative_to(stage_cache.folder).as_posix() for path in files if path.is_file()]
 
@@ -333,7 +331,7 @@ def copy_to_output(product: Path, output: Path, *, overwrite: bool) -> Path:
         return copy_if_different(product, output, overwrite=overwrite)
     files = {path: output / path.relative_to(product) for path in sorted(product.rglob("*")) if path.is_file()}
     different = [target for path, target in files.items() if file_digest(path) != file_digest(target)]
-    # The poster of a copy that an earlier call has begun is not a photo of the user.
+    # The rules of Outputs would take the poster of an unfinished copy for a photo of the user.
     is_begun = len(different) < len(files)
     if not is_begun or any(map(os.path.lexists, different)):
         Outputs(overwrite=overwrite).folder(output, [os.path.relpath(target, output) for target in different])

@@ -26,7 +26,7 @@ class WorkFolderState:
     The record of a stage has these parts:
 
         inputs     plain values on which the product of the stage depends
-        fixed      plain values that stay as they were when the stage was begun
+        fixed      plain values that later calls take over from the call that began the stage
         files      digests of the files that the stage wrote, by path relative to the folder
         facts      plain values for the report
         seconds    time that the stage has taken
@@ -54,8 +54,8 @@ class WorkFolderState:
             ) from error
         if entries and RECORD_NAME not in entries and not all(name.startswith(".") for name in entries):
             raise HyrfError(
-                f"{folder}: this folder holds other files and is no work folder",
-                fix="choose another with `work`",
+                f"{folder}: this folder holds other files and is not a work folder",
+                fix="choose another folder with `work`",
             )
 
     def was_begun(self, stage: str, inputs: dict[str, Any]) -> bool:
@@ -68,7 +68,7 @@ class WorkFolderState:
         return self.was_begun(stage, inputs) or self.facts(stage, inputs) is not None
 
     def changed_inputs(self, stage: str, inputs: dict[str, Any]) -> list[str]:
-        """Return why the product of a stage cannot be reused: changed inputs or "its files"; empty if never begun."""
+        """Return the names of the changed inputs of a stage, or "its files"; an empty list if it was never begun."""
         if stage not in self._stage_records:
             return []
         before, now = self._stage_records[stage]["inputs"], _to_json_values(inputs)
@@ -155,7 +155,7 @@ def _parse_stage_records(content: bytes) -> dict[str, dict[str, Any]]:
     try:
         table = json.loads(content)
         if table["version"] != RECORD_VERSION:
-            raise ValueError("it is of another version of hyrfpack")
+            raise ValueError("another version of hyrfpack wrote it")
         stages = table["stages"]
         for record in stages.values():
             parts = [record["inputs"], *(record.get(name, {}) for name in ("fixed", "files", "facts"))]

@@ -82,7 +82,7 @@ def test_a_failed_first_look_is_logged_and_the_estimation_goes_on(make, photos, 
     monkeypatch.setattr(sys.modules["hyrfpack.poses"], "estimate_poses", fail_first)
     with caplog.at_level(logging.INFO, "hyrfpack"):
         result = make(observer=lambda trainer: None)
-    assert sum("there is no first look: no two photos overlap" in message for message in caplog.messages) == 1
+    assert sum("the first look is skipped: no two photos overlap" in message for message in caplog.messages) == 1
     assert [message for message in caplog.messages if message.startswith("a note")] == [f"a note on {photos.name}"]
     assert result.output.is_file() and not (result.work / "first_look").exists()
 

@@ -316,7 +316,7 @@ def test_an_output_whose_intermediate_results_are_missing_needs_overwrite(name, 
     output = tmp_path / "scene.hyrf"
     work = make_scene(posed, output).work
     (work / name).rename(tmp_path / "moved")
-    with pytest.raises(HyrfError, match=f"result of its {stage} stage in .* is missing .*`overwrite=True`"):
+    with pytest.raises(HyrfError, match=f"product of its {stage} stage in .* is missing .*`overwrite=True`"):
         make_scene(posed, output)
     assert stage not in make_scene(posed, output, overwrite=True).kept
     assert len(make_scene(posed, output).kept) == 4
@@ -403,11 +403,11 @@ def test_impossible_requests_are_rejected_before_any_work(posed, photos, finishe
         ("is a file, not a folder", posed, "-o", tmp_path / "there.html" / "scene.html"),
         ("reads what lies in this folder", photos, "-o", photos / "scene.html"),
         ("the work folder would lie among the photos", photos, "-o", photos / "made" / "scene.html"),
-        ("lie in each other", posed, "-o", tmp_path / "work" / "a.html", "--work", tmp_path / "work"),
+        ("may not contain each other", posed, "-o", tmp_path / "work" / "a.html", "--work", tmp_path / "work"),
         ("holds other files", posed, "-o", out, "--work", tmp_path / "full"),
         ("the folder is empty", tmp_path / "empty", "-o", out),
         ("none is left to train on; hold out fewer with --test-every", photos, "-o", out, "--test-every", 1),
-        ("but clip.mp4; name the video", tmp_path / "videos", "-o", out),
+        ("but the video clip.mp4; name the video itself", tmp_path / "videos", "-o", out),
         ("is a .hyrf file already", finished_work / "model.hyrf", "-o", tmp_path / "a.hyrf"),
         ("were given; leave out --minutes", finished_work / "model.hyrf", "-o", out, "--minutes", 3),
         (
@@ -457,7 +457,7 @@ def test_a_failed_stage_names_its_folder_and_keeps_finished_stages(posed, tmp_pa
     with monkeypatch.context() as patch:
         patch.setattr("hyrfpack.make.stages.compress_model", full)
         sentence = refused("make", posed, "-o", tmp_path / "scene.html", "--quality", "draft")
-    assert "compression failed: the disk is full; free some space; what is finished is kept in" in sentence
+    assert "compression failed: the disk is full; free some space; finished work is kept in" in sentence
     assert make_scene(posed, tmp_path / "scene.html", MakeConfig(quality="draft")).kept == ("training",)
 
 
@@ -480,7 +480,7 @@ def test_a_failure_after_poses_keeps_them_and_says_so(photos, poses, tmp_path, m
 
     with monkeypatch.context() as patch:
         patch.setattr(stages, "train_model", fail)
-        with pytest.raises(HyrfError, match="training failed: .*; what is finished is kept in"):
+        with pytest.raises(HyrfError, match="training failed: .*; finished work is kept in"):
             make_scene(photos, tmp_path / "scene.html")
     assert make_scene(photos, tmp_path / "scene.html").kept == ("poses",)
 
@@ -576,7 +576,7 @@ def test_training_estimates_poses_once_with_the_option(photos, poses, tmp_path):
     (tmp_path / "run" / "metrics.json").unlink()
     shutil.rmtree(tmp_path / "run" / "views")
     (tmp_path / "run" / "curve.png").unlink()
-    assert "poses are taken from" in succeeded(*arguments).stderr
+    assert "reusing the poses in" in succeeded(*arguments).stderr
     assert len(poses) == 1
     succeeded(*arguments, "--overwrite")
     assert len(poses) == 2

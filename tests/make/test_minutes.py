@@ -50,7 +50,7 @@ def test_steps_are_limited_to_a_full_run(scene):
 
 
 def test_step_time_grows_with_the_number_of_pixels(scene):
-    four = MEASURED_COST.scaled_to_pixels(4.0)
+    four = MEASURED_COST.scaled_by_pixels(4.0)
     assert four.training_seconds(scene, 1000) - MEASURED_COST.training_seconds(scene, 1000) == pytest.approx(
         3 * (MEASURED_COST.training_seconds(scene, 1000) - MEASURED_COST.decoding_seconds * len(scene.train))
     )
@@ -124,8 +124,16 @@ def test_photos_that_are_small_already_are_timed_at_the_size_asked_for(posed, sc
 
     monkeypatch.setattr(minutes, "measure_scene_cost", cost)
     monkeypatch.setattr(minutes, "CANDIDATE_PHOTO_SIZES", (24, 16, 8))
-    reading = LoadSettings(max_size=32)
-    arguments = (posed, reading, reading.load(posed), make_plan(90_000), CPU_DEVICE, monotonic() + 3000.0, 0)
+    load_settings = LoadSettings(max_size=32)
+    arguments = (
+        posed,
+        load_settings,
+        load_settings.load(posed),
+        make_plan(90_000),
+        CPU_DEVICE,
+        monotonic() + 3000.0,
+        0,
+    )
     fit_plan_to_minutes(*arguments, PictureCache(), Reporter(["training"], ignore_progress))
     assert timed == [32]
 
@@ -191,12 +199,12 @@ def test_an_explicit_number_of_gaussians_replaces_the_measured_budget(posed, sce
 
 def test_photos_are_never_larger_than_asked_for(posed, scene, monkeypatch):
     monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(1e-3, 0.0, 0.0, 0.0, 100))
-    reading = LoadSettings(max_size=24)
+    load_settings = LoadSettings(max_size=24)
     for seconds in (600.0, -1.0):
         arguments = (
             posed,
-            reading,
-            reading.load(posed),
+            load_settings,
+            load_settings.load(posed),
             make_plan(90_000),
             CPU_DEVICE,
             monotonic() + seconds,
