@@ -70,7 +70,7 @@ def _extract_frames(video: Path, folder: Path, progress: Progress) -> Path:
     """Write the chosen frames of a video into a new folder, and return the folder."""
     from hyrfpack.poses.frames import choose_frames
 
-    choose_frames(video, folder, most=MAX_PHOTOS, progress=progress)
+    choose_frames(video, folder, max_frames=MAX_PHOTOS, progress=progress)
     return folder
 
 

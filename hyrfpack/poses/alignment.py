@@ -38,8 +38,13 @@ class PoseAlignment:
     @property
     def agreeing(self) -> frozenset[str]:
         """Return the photos whose poses agree; none if fewer than three do, because any two cameras can be aligned."""
-        agree = (self.distance <= MAX_POSITION_DIFFERENCE_RATIO) & (self.angle <= MAX_ROTATION_DIFFERENCE_DEGREES)
+        agree = _agreement_mask(self.distance, self.angle)
         return frozenset(np.array(self.names)[agree].tolist()) if agree.sum() > 2 else frozenset()
+
+
+def _agreement_mask(distance: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Return which poses agree (N,) bool, by the differences of `PoseAlignment`."""
+    return (distance <= MAX_POSITION_DIFFERENCE_RATIO) & (angle <= MAX_ROTATION_DIFFERENCE_DEGREES)
 
 
 def camera_positions(poses: Poses) -> np.ndarray:
@@ -73,28 +78,26 @@ def align_poses(a: Poses, b: Poses) -> PoseAlignment:
         The alignment, over the photos that both have.
     """
     names = sorted(set(a) & set(b))
-    size = camera_extent(b)
-    if len(names) < 2 or size <= 0:
+    extent = camera_extent(b)
+    if len(names) < 2 or extent <= 0:
         return PoseAlignment(names, np.full(len(names), np.inf), np.full(len(names), 180.0))
     rotations_a, rotations_b = (np.array([poses[name][:, :3] for name in names]) for poses in (a, b))
     positions_a, positions_b = (camera_positions({name: poses[name] for name in names}) for poses in (a, b))
     relative_rotations = np.einsum("nji,njk->nik", rotations_b, rotations_a)  # (N, 3, 3), one for each camera
 
-    def errors(scale: float, rotation: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        distance = np.linalg.norm(scale * positions_a @ rotation.T + shift - positions_b, axis=1) / size
+    def differences(scale: float, rotation: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the distances and angles of `PoseAlignment` after a similarity transform."""
+        distance = np.linalg.norm(scale * positions_a @ rotation.T + shift - positions_b, axis=1) / extent
         cosine = (np.einsum("nij,ij->n", relative_rotations, rotation) - 1) / 2
         return distance, np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
-    def score(guess: tuple[float, np.ndarray, np.ndarray]) -> float:
+    def score(similarity: tuple[float, np.ndarray, np.ndarray]) -> float:
         """Return the number of agreeing cameras, each weighted by how closely it agrees (MSAC)."""
-        distance, angle = errors(*guess)
+        distance, angle = differences(*similarity)
         closeness = (
             1 - (distance / MAX_POSITION_DIFFERENCE_RATIO) ** 2 / 2 - (angle / MAX_ROTATION_DIFFERENCE_DEGREES) ** 2 / 2
         )
-        return float(closeness[is_same(distance, angle)].sum())
-
-    def is_same(distance: np.ndarray, angle: np.ndarray) -> np.ndarray:
-        return (distance <= MAX_POSITION_DIFFERENCE_RATIO) & (angle <= MAX_ROTATION_DIFFERENCE_DEGREES)
+        return float(closeness[_agreement_mask(distance, angle)].sum())
 
     best, best_score = (1.0, np.eye(3), np.zeros(3)), -1.0
     for i, j in _sample_camera_pairs(len(names)):
@@ -104,20 +107,20 @@ def align_poses(a: Poses, b: Poses) -> PoseAlignment:
         rotation = nearest_rotation(relative_rotations[i] + relative_rotations[j])
         scale = float(np.linalg.norm(positions_b[j] - positions_b[i]) / length)
         shift = (positions_b[i] + positions_b[j] - scale * rotation @ (positions_a[i] + positions_a[j])) / 2
-        guess = (scale, rotation, shift)
-        if (found := score(guess)) > best_score:
-            best, best_score = guess, found
+        candidate = (scale, rotation, shift)
+        if (candidate_score := score(candidate)) > best_score:
+            best, best_score = candidate, candidate_score
     for _ in range(_MAX_REFINEMENT_ROUNDS):
-        inside = is_same(*errors(*best))
-        if inside.sum() < 2:
+        agree = _agreement_mask(*differences(*best))
+        if agree.sum() < 2:
             break
-        guess = _fit_similarity(
-            positions_a[inside], positions_b[inside], relative_rotations[inside], MAX_POSITION_DIFFERENCE_RATIO * size
+        candidate = _fit_similarity(
+            positions_a[agree], positions_b[agree], relative_rotations[agree], MAX_POSITION_DIFFERENCE_RATIO * extent
         )
-        if (found := score(guess)) <= best_score:
+        if (candidate_score := score(candidate)) <= best_score:
             break
-        best, best_score = guess, found
-    distance, angle = errors(*best)
+        best, best_score = candidate, candidate_score
+    distance, angle = differences(*best)
     return PoseAlignment(names, distance, angle, *best)
 
 

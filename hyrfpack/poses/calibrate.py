@@ -65,9 +65,13 @@ def search_focal_ratio(
     for index, focal in enumerate(CANDIDATE_FOCAL_RATIOS):
         progress(TaskEvent(task, index / len(CANDIDATE_FOCAL_RATIOS)))
         candidate = camera_with_focal(camera, focal)
-        found = [pycolmap.estimate_essential_matrix(p.pixels1, p.pixels2, candidate, candidate, options) for p in pairs]
-        shares = [0.0 if f is None else f["num_inliers"] / len(p.pixels1) for f, p in zip(found, pairs, strict=True)]
-        scores.append(np.mean(shares) - _PRIOR_PENALTY * (np.log(focal / DEFAULT_FOCAL_RATIO) / _PRIOR_LOG_WIDTH) ** 2)
+        inlier_ratios = []
+        for pair in pairs:
+            fit = pycolmap.estimate_essential_matrix(pair.pixels1, pair.pixels2, candidate, candidate, options)
+            inlier_ratios.append(0.0 if fit is None else fit["num_inliers"] / len(pair.pixels1))
+        scores.append(
+            np.mean(inlier_ratios) - _PRIOR_PENALTY * (np.log(focal / DEFAULT_FOCAL_RATIO) / _PRIOR_LOG_WIDTH) ** 2
+        )
     return float(CANDIDATE_FOCAL_RATIOS[int(np.argmax(scores))])
 
 

@@ -10,7 +10,7 @@ from hyrfpack.poses.alignment import Poses, align_poses
 
 _MAPPER_NAMES = {"incremental": "the incremental mapper", "global": "the global mapper"}
 _TIE_MATCH_RATIO = 0.002  # a lead of at most this ratio of all matches is not significant
-_MIN_CONFIRMED_RATIO = 0.9  # the report mentions it if the mappers agree on a smaller ratio of the photos
+_MIN_CONFIRMED_RATIO = 0.9  # a note warns if the mappers agree on a smaller ratio of the photos
 _MIN_AGREEING_RATIO = 0.95  # two mappers that agree on this ratio of the photos confirm each other
 
 
@@ -85,23 +85,24 @@ def confirm_each_other(first: Sequence[Poses], second: Sequence[Poses], count: i
     return len(align_poses(first[0], second[0]).agreeing) >= _MIN_AGREEING_RATIO * count
 
 
-def describe_doubt(poses: Poses, other: Candidate | None) -> str:
+def describe_unconfirmed_poses(poses: Poses, other: Candidate | None) -> str:
     """Return a sentence about the photos that are not confirmed; "" if enough are."""
-    agreed = confirmed_photos(poses, other)
-    if len(agreed) >= _MIN_CONFIRMED_RATIO * len(poses):
+    confirmed = confirmed_photos(poses, other)
+    if len(confirmed) >= _MIN_CONFIRMED_RATIO * len(poses):
         return ""
     if other is None:
         return (
-            f"the poses of these {len(poses)} photos are not confirmed, because only one mapper found any; check them"
+            f"the poses of these {len(poses)} photos are not confirmed, because only one mapper registered photos, so "
+            "check the result before you use it"
         )
     lacking = len(set(poses).difference(other.poses, *other.other_pieces))
-    in_other_pieces = len(set().union(*other.other_pieces).intersection(poses).difference(agreed))
-    unlike = len(poses) - len(agreed) - lacking - in_other_pieces
-    parts = [f"gives {format_count(unlike, 'photo')} other poses"] if unlike > 0 else []
+    in_other_pieces = len(set().union(*other.other_pieces).intersection(poses).difference(confirmed))
+    different = len(poses) - len(confirmed) - lacking - in_other_pieces
+    parts = [f"gives {format_count(different, 'photo')} other poses"] if different > 0 else []
     parts += [f"has {format_count(in_other_pieces, 'photo')} in separate reconstructions"] if in_other_pieces else []
     parts += [f"has no pose for {format_count(lacking, 'photo')}"] if lacking else []
     return (
-        f"{len(agreed)} of {len(poses)} poses are confirmed by both mappers; {_MAPPER_NAMES[other.mapper]} "
+        f"{len(confirmed)} of {len(poses)} poses are confirmed by both mappers; {_MAPPER_NAMES[other.mapper]} "
         f"{' and '.join(parts)}, so check the result before you use it"
     )
 

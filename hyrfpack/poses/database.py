@@ -29,23 +29,23 @@ _UNUSABLE_PAIR_KINDS = ("UNDEFINED", "DEGENERATE", "WATERMARK")
 @contextmanager
 def open_database(job: Job) -> Iterator[pycolmap.Database]:
     """Open the database and close it at the end of the block."""
-    database = pycolmap.Database.open(job.database)
+    database = pycolmap.Database.open(job.database_path)
     try:
         yield database
     finally:
         database.close()
 
 
-def make_database(job: Job) -> None:
+def create_database(job: Job) -> None:
     """Create the database with all cameras and photos, unless it exists.
 
     Cameras and photos are written in order, so that later results do not depend on the order of threads. Cameras have
     one coefficient of radial distortion. Their focal length counts as known even if it is a guess. So pairs are
     verified by calibrated geometry, or by uncalibrated geometry if that explains more matches.
     """
-    if job.database.exists():
+    if job.database_path.exists():
         return
-    unfinished = job.database.with_suffix(".new")
+    unfinished = job.database_path.with_suffix(".new")
     unfinished.unlink(missing_ok=True)
     database = pycolmap.Database.open(unfinished)
     for number, device in enumerate(job.devices, start=1):
@@ -57,17 +57,17 @@ def make_database(job: Job) -> None:
         rig.rig_id = number
         rig.add_ref_sensor(camera.sensor_id)
         database.write_rig(rig, use_rig_id=True)
-    for number, of in enumerate(job.device_of, start=1):
-        image = pycolmap.Image(name=job.working_name(number), camera_id=of + 1, image_id=number)
+    for number, device_index in enumerate(job.device_indices, start=1):
+        image = pycolmap.Image(name=job.working_name(number), camera_id=device_index + 1, image_id=number)
         image.frame_id = number
         frame = pycolmap.Frame()
         frame.frame_id = number
-        frame.rig_id = of + 1
+        frame.rig_id = device_index + 1
         frame.add_data_id(image.data_id)
         database.write_frame(frame, use_frame_id=True)
         database.write_image(image, use_image_id=True)
     database.close()
-    os.replace(unfinished, job.database)
+    os.replace(unfinished, job.database_path)
 
 
 def verified_pairs(database: pycolmap.Database) -> Iterator[tuple[int, int, np.ndarray]]:
@@ -102,14 +102,14 @@ def recalibrate(job: Job, step_name: str, decide: Callable[[Cameras], Cameras], 
     Returns:
         Whether any camera was replaced.
     """
-    decisions_path, done = job.work / f"{step_name}.json", job.work / f"{step_name}.done"
+    decisions_path, done_marker = job.work / f"{step_name}.json", job.work / f"{step_name}.done"
     with open_database(job) as database:
         cameras = read_cameras(database)
     if not decisions_path.exists():
         better_parameters = {number: camera.params.tolist() for number, camera in decide(cameras).items()}
         write_atomic(decisions_path, json.dumps(better_parameters).encode())
     decisions = json.loads(decisions_path.read_text())
-    if decisions and not done.exists():
+    if decisions and not done_marker.exists():
         with open_database(job) as database:
             for number, parameters in decisions.items():
                 camera = cameras[int(number)]
@@ -121,16 +121,16 @@ def recalibrate(job: Job, step_name: str, decide: Callable[[Cameras], Cameras], 
 
         def report_done(done: int) -> None:
             share = min(done / max(count, 1), 1.0)
-            doing = f"verifying pairs with refined focal lengths {min(done, count)}/{count}"
-            report_progress(TaskEvent(doing, 0.5 + 0.5 * share))
+            task = f"verifying pairs with refined focal lengths {min(done, count)}/{count}"
+            report_progress(TaskEvent(task, 0.5 + 0.5 * share))
 
         verifier_options = pycolmap.GeometricVerifierOptions()
         verifier_options.num_threads = thread_count()
         with report_new_rows(job, "two_view_geometries", report_done):
             pycolmap.geometric_verification(
-                job.database, verifier_options, two_view_geometry_options=verification_options(job.seed)
+                job.database_path, verifier_options, two_view_geometry_options=verification_options(job.seed)
             )
-        done.touch()
+        done_marker.touch()
     return bool(decisions)
 
 

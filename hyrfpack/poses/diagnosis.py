@@ -1,4 +1,4 @@
-"""Explain why no poses can be found for a set of photos, and why single photos are left out."""
+"""Explain why no poses can be estimated for a set of photos, and why single photos are left out."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ def check_photo_count(given: Path, folder: Path, usable: int, left_out: Mapping[
             fix="take photos from many places",
         )
     if unreadable := select_unreadable(left_out):
-        left = f", and the {usable} that can be read {'is' if usable == 1 else 'are'} too few" if usable else ""
-        raise unreadable_error(given, unreadable, count, left)
+        consequence = f", and the {usable} that can be read {'is' if usable == 1 else 'are'} too few" if usable else ""
+        raise unreadable_error(given, unreadable, count, consequence)
     raise HyrfDataError(
-        f"{given}: {format_count(usable, 'photo is', 'photos are')} too few to find poses",
+        f"{given}: {format_count(usable, 'photo is', 'photos are')} too few to estimate poses",
         fix="take 20 or more from different places, each sharing two thirds of its view with the next",
     )
 
@@ -98,45 +98,48 @@ def check_matches(folder: Path, count: int, matches: Mapping[str, Any]) -> None:
         )
 
 
-def check_registered(folder: Path, count: int, found: Mapping[str, Any]) -> None:
+def check_registered(folder: Path, count: int, result: Mapping[str, Any]) -> None:
     """Check the answer of `finish.finish_reconstruction`.
 
     Raises:
         HyrfDataError: too few photos have a pose.
     """
-    if len(found["registered"]) < MIN_PHOTOS:
+    if len(result["registered"]) < MIN_PHOTOS:
         raise HyrfDataError(
-            f"{folder}: no poses could be found, because these {count} photos overlap too little",
+            f"{folder}: no poses could be estimated, because these {count} photos overlap too little",
             fix="take more photos between them, each sharing two thirds of its view with the next",
         )
 
 
 def blurred_photos(features: Mapping[str, Any]) -> frozenset[str]:
     """Return the photos that are blurred compared with the others."""
-    sharp = features["sharpness"]
-    return frozenset(name for name, is_so in zip(sharp, is_blurred(list(sharp.values())), strict=True) if is_so)
+    sharpness = features["sharpness"]
+    mask = is_blurred(list(sharpness.values()))
+    return frozenset(name for name, blurred in zip(sharpness, mask, strict=True) if blurred)
 
 
 def explain_unposed(
-    names: Sequence[str], features: Mapping[str, Any], matches: Mapping[str, Any], found: Mapping[str, Any]
+    names: Sequence[str], features: Mapping[str, Any], matches: Mapping[str, Any], result: Mapping[str, Any]
 ) -> dict[str, str]:
     """Return the reason for each decodable photo that has no pose.
 
     Args:
         names: names of the photos that could be decoded.
-        features, matches, found: the answers of the stages that find features, match and finish.
+        features: the answer of `features.find_features`.
+        matches: the answer of `matching.match_photos`.
+        result: the answer of `finish.finish_reconstruction`.
     """
-    soft, posed = blurred_photos(features), set(found["registered"])
+    blurred, posed = blurred_photos(features), set(result["registered"])
 
     def reason(name: str) -> str:
-        if name in found["apart"]:
+        if name in result["in_other_pieces"]:
             return "belongs to a separate reconstruction, because too few matches connect it to the other photos"
         if (
             features["keypoints"].get(name, 0) < _MIN_TYPICAL_FEATURES
             and features["sharpness"].get(name, 0) < _MIN_CONTENT_SHARPNESS
         ):
             return "too few features"
-        if name in soft:
+        if name in blurred:
             return "blurred"
         if name not in matches["matched"]:
             return "no matches with other photos"

@@ -70,8 +70,8 @@ class PosesReport:
         left_out: the reason for each photo without a pose, by its path relative to the given folder; frames of a video
             and faces of panoramas by their names in images/.
         mapper: the mapper whose result was chosen, "incremental" or "global".
-        why: reason for the choice, a sentence with the figures of both mappers.
-        notes: sentences about doubts and about the treatment of the photos.
+        why: the reason for the choice, a sentence with the figures of both mappers.
+        notes: sentences about uncertain poses and about how the photos were treated.
         seconds: duration of each stage in this call.
     """
 
@@ -114,7 +114,7 @@ def estimate_poses(
         context: progress and stop.
 
     Returns:
-        The number of registered photos, the choice that was made, and doubts about it.
+        The number of registered photos, the chosen mapper, and notes about uncertain poses.
 
     Raises:
         HyrfDataError: there are too few photos, they do not overlap, or they show the scene from one place only.
@@ -185,9 +185,9 @@ class _PoseEstimation:
         self._add_notes(unreadable_sentences(unreadable, self.photo_count), logging.WARNING)
         matches = self._run_stage("matches")
         diagnosis.check_matches(self.given_path, self.photo_count, matches)
-        found = self._run_stage("finish", *self._run_mappers())
-        diagnosis.check_registered(self.given_path, len(job.names), found)
-        return self._write_result(job, features, matches, found)
+        result = self._run_stage("finish", *self._run_mappers())
+        diagnosis.check_registered(self.given_path, len(job.names), result)
+        return self._write_result(job, features, matches, result)
 
     def _prepare_job(self) -> Job:
         """Prepare photos and masks and return the job."""
@@ -203,12 +203,11 @@ class _PoseEstimation:
             self.output.check_free("images")
         if is_video:
             self._claim_work_folder()
-            root = self._take_frames()
+            root = self._extract_frames()
             source_files = list_photos(root)
             if any(is_panorama(frame) for frame in source_files):
                 raise HyrfDataError(
-                    f"{self.given_path}: this video shows all around (360 degrees), and only pictures that do are cut "
-                    "into photos",
+                    f"{self.given_path}: this is a 360-degree video, which cannot be cut into photos directly",
                     fix="save frames of the video as pictures in a folder, and name that folder",
                 )
         copies_photos = not (in_place or is_video)
@@ -218,14 +217,7 @@ class _PoseEstimation:
         self.photo_count = len(photos) + len(self.left_out)
         diagnosis.check_photo_count(self.given_path, root, len(photos), self.left_out)
         self.user_names = self._map_user_names(photos)
-        found_masks = find_masks(photos, mask_folder, not copies_photos) if mask_folder else MaskMatches()
-        masks = found_masks.by_photo
-        self._add_notes(found_masks.notes, logging.WARNING)
-        if self.masks is not None and not masks:
-            raise HyrfDataError(
-                f"{self.masks}: no mask has the name of a photo ({photos[0].source}.png)",
-                fix="rename the masks",
-            )
+        masks = self._match_masks(photos, mask_folder, in_place=not copies_photos)
         copies_masks = bool(masks) and mask_folder is not None and not is_same_path(mask_folder, self.out / "masks")
         if copies_masks:
             self.output.check_free("masks")
@@ -240,18 +232,33 @@ class _PoseEstimation:
         self._note_photos(photos, masks, copies_photos, turned=not in_place)
         if not is_video:
             self._add_notes(raw_photos_notes(self._list_photos(root if in_place else self.photos, list_raw_photos)))
-        devices, device_of = group_by_device(photos, in_place=not copies_photos)
+        return self._save_job(photos, masks, root, in_place=not copies_photos)
+
+    def _match_masks(self, photos: list[Photo], folder: Path | None, in_place: bool) -> dict[str, Path]:
+        """Return the masks in a folder by photo name, and add notes about masks that match no photo."""
+        matches = find_masks(photos, folder, in_place) if folder else MaskMatches()
+        self._add_notes(matches.notes, logging.WARNING)
+        if self.masks is not None and not matches.by_photo:
+            raise HyrfDataError(
+                f"{self.masks}: no mask has the name of a photo (such as {photos[0].source}.png)",
+                fix="give each mask the name of its photo",
+            )
+        return matches.by_photo
+
+    def _save_job(self, photos: list[Photo], masks: dict[str, Path], root: Path, in_place: bool) -> Job:
+        """Describe the prepared photos and masks by a job, save it for the stages, and return it."""
+        devices, device_indices = group_by_device(photos, in_place)
         if len(devices) > 1:
             self._add_note(
                 f"{len(devices)} cameras or zooms are distinguished by folder, device, size and focal length"
             )
-        ordered = is_video or (len(photos) > MAX_EXHAUSTIVE_PHOTOS and is_ordered_sequence(photos))
+        ordered = self.is_video or (len(photos) > MAX_EXHAUSTIVE_PHOTOS and is_ordered_sequence(photos))
         job = Job(
             root.resolve(),
             self.output.work.resolve(),
             tuple(photo.name for photo in photos),
             devices,
-            device_of,
+            device_indices,
             {name: str(path.resolve()) for name, path in masks.items()},
             choose_matching(len(photos), ordered) if self.config.matching == "auto" else self.config.matching,
             self.config.seed,
@@ -271,40 +278,39 @@ class _PoseEstimation:
         """Return whether the photos are already those in the scene's images/."""
         if not (is_same_path(self.photos, self.out) and images.is_dir()):
             return is_same_path(self.photos, images)
-        ours = any(name.startswith("images/") for name in self.output.owned_files())
-        return not (
-            ours and self._list_photos(self.photos)
-        )  # if the originals lie beside our copies, the originals are the photos
+        has_copies = any(name.startswith("images/") for name in self.output.owned_files())
+        # If the folder also holds the originals of these copies, the originals are the photos.
+        return not (has_copies and self._list_photos(self.photos))
 
     def _find_mask_folder(self, in_place: bool) -> Path | None:
-        """Return the folder of masks that is given or found beside the photos; None if there is none."""
+        """Return the given folder of masks, or that in or beside the folder of photos; None if there is none."""
         if self.masks is not None:
             if not Path(self.masks).is_dir():
-                raise HyrfDataError(f"{self.masks}: there is no such folder of masks", fix="name another")
+                raise HyrfDataError(f"{self.masks}: there is no such folder of masks", fix="name another folder")
             return Path(self.masks)
         if self.photos.is_file():
             return None
-        beside = [self.out / "masks"] if in_place else [self.photos / "masks", self.photos / "mask"]
+        candidates = [self.out / "masks"] if in_place else [self.photos / "masks", self.photos / "mask"]
         if self.photos.name == "images":
-            beside.append(self.photos.parent / "masks")
-        return next((folder for folder in beside if folder.is_dir()), None)
+            candidates.append(self.photos.parent / "masks")
+        return next((folder for folder in candidates if folder.is_dir()), None)
 
     def _claim_work_folder(self) -> None:
-        """Create the folder of products in progress, or take over that of an interrupted call."""
+        """Create the folder of products in progress, or take over the folder of an interrupted call."""
         self.has_products = self.output.claim_work_folder([self.config.matching, self.config.seed])
         self.has_work_folder = True
         if self.has_products:
             _LOG.info("resuming an interrupted estimation")
 
-    def _take_frames(self) -> Path:
-        """Write the chosen frames of the video; return their folder."""
+    def _extract_frames(self) -> Path:
+        """Write the chosen frames of the video into a folder, and return the folder."""
         report_frames = part_of_progress(partial(self._report_progress, "photos"), 0.0, 0.9)
 
-        def take(folder: Path) -> FrameReport:
+        def write_frames(folder: Path) -> FrameReport:
             return choose_frames(self.photos, folder, progress=report_frames)
 
-        folder = self.output.make_folder("images", take, resume_filling=True)
-        frames = take(folder)  # reads the record of the frames, which are now all written
+        folder = self.output.make_folder("images", write_frames, resume_filling=True)
+        frames = write_frames(folder)  # all frames are written now, so this call only reads their record
         self._add_note(
             format_count(frames.taken, f"of {frames.of} frames was taken", f"of {frames.of} frames were taken")
         )
@@ -343,15 +349,15 @@ class _PoseEstimation:
         if faces := sum(photo.face is not None for photo in photos):
             panoramas = format_count(faces // len(CUBE_FACES), "panorama was", "panoramas were")
             self._add_note(f"{panoramas} cut into {faces} photos")
-        sideways = sum(photo.facts.orientation != 1 for photo in photos)
-        if sideways and turned:
+        sideways_count = sum(photo.facts.orientation != 1 for photo in photos)
+        if sideways_count and turned:
             was_stored = "that the camera stored sideways"
             self._add_note(
-                f"{format_count(sideways, f'photo {was_stored} was', f'photos {was_stored} were')} turned upright"
+                f"{format_count(sideways_count, f'photo {was_stored} was', f'photos {was_stored} were')} turned upright"
             )
-        elif sideways:
+        elif sideways_count:
             used = "stored sideways and used in that orientation"
-            self._add_note(format_count(sideways, f"photo is {used}", f"photos are {used}"))
+            self._add_note(format_count(sideways_count, f"photo is {used}", f"photos are {used}"))
 
     def _run_stage(self, stage: str, *more: str) -> dict[str, Any]:
         """Run a stage in its process and return its answer."""
@@ -364,9 +370,9 @@ class _PoseEstimation:
         return answer
 
     def _run_mappers(self) -> list[str]:
-        """Run both mappers, and again unless they agree; return the names of their results.
+        """Run both mappers, repeat them unless they agree, and return the names of their results.
 
-        A crash of one of them becomes a note.
+        If one of the mappers crashes, a note is added.
         """
         answers: dict[str, dict[str, Any]] = {}
         failures = []
@@ -376,7 +382,7 @@ class _PoseEstimation:
             except StageCrashedError as error:
                 failures.append(error)
                 self._add_note(
-                    f"the {stage} mapper failed, so the result of the other one is used unchecked: {error}",
+                    f"the {stage} mapper failed, so the result of the other one is used without confirmation: {error}",
                     logging.WARNING,
                 )
         if len(failures) == 2:
@@ -386,44 +392,43 @@ class _PoseEstimation:
                 answers["repeat"] = self._run_stage("repeat")
             except StageCrashedError as error:
                 self._add_note(
-                    f"the mappers failed when they were repeated, so their first results are used: {error}",
+                    f"the repetition of the mappers failed, so their first results are used: {error}",
                     logging.WARNING,
                 )
         return [name for answer in answers.values() for name in answer["models"]]
 
     def _write_result(
-        self, job: Job, features: dict[str, Any], matches: dict[str, Any], found: dict[str, Any]
+        self, job: Job, features: dict[str, Any], matches: dict[str, Any], result: dict[str, Any]
     ) -> PosesReport:
-        """Move the scene to its place and return the report."""
-        registered = set(found["registered"])
+        """Move the scene to its place and return the report; `result` is the answer of the last stage."""
+        registered = set(result["registered"])
         decoded = [name for name in job.names if name not in features["unreadable"]]
-        unposed = diagnosis.explain_unposed(decoded, features, matches, found)
+        unposed = diagnosis.explain_unposed(decoded, features, matches, result)
         self.left_out |= {self._user_name(name): reason for name, reason in unposed.items()}
-        if found["doubt"]:
-            self._add_note(found["doubt"], logging.WARNING)
-        if found["angle"] < _MIN_RAY_ANGLE_DEGREES:
+        if result["warning"]:
+            self._add_note(result["warning"], logging.WARNING)
+        if result["angle"] < _MIN_RAY_ANGLE_DEGREES:
             self._add_note(
-                "the photos are taken from nearly one place, so depth is uncertain; move sideways between photos",
+                "the photos were taken from nearly one place, so depth is uncertain; move sideways between photos",
                 logging.WARNING,
             )
         if blurred := diagnosis.blurred_photos(features) & registered:
-            found_blurred = format_count(len(blurred), "of the posed photos is", "of the posed photos are")
-            self._add_note(f"{found_blurred} more blurred than the others", logging.WARNING)
+            blurred_are = format_count(len(blurred), "of the posed photos is", "of the posed photos are")
+            self._add_note(f"{blurred_are} more blurred than the others", logging.WARNING)
         report = PosesReport(
             self.out,
             self.photo_count,
             len(registered),
-            len(found["sure"]),
+            len(result["sure"]),
             dict(sorted(self.left_out.items())),
-            found["mapper"],
-            found["why"],
+            result["mapper"],
+            result["why"],
             tuple(self.notes),
             {stage: round(seconds, 1) for stage, seconds in self.seconds.items()},
         )
-        unsure = sorted(registered.difference(found["sure"]))
-        self.output.check_replaceable(
-            self.photos, self.overwrite
-        )  # again, because another program may have written poses meanwhile
+        unsure = sorted(registered.difference(result["sure"]))
+        # The folder is checked again, because another program may have written poses into it meanwhile.
+        self.output.check_replaceable(self.photos, self.overwrite)
         self.output.install(job.model_folder("chosen"), asdict(report) | {"scene": str(self.out), "unsure": unsure})
         return report
 
@@ -461,7 +466,7 @@ class _PoseEstimation:
 
 
 def _raise_if_scene_file(path: Path) -> None:
-    """Raise HyrfDataError if a path is a file of splats or a model, which would be taken for a video."""
+    """Raise HyrfDataError if a path is a file of splats or a model, which would otherwise be read as a video."""
     if not path.is_file():
         return
     if path.suffix.lower() == ".hyrf":

@@ -18,7 +18,7 @@ from hyrfpack.data.pictures import read_mask, read_pixels
 from hyrfpack.data.quality import measure_sharpness
 from hyrfpack.errors import HyrfDataError, strip_path
 from hyrfpack.parallel.threads import thread_count
-from hyrfpack.poses.database import make_database, open_database
+from hyrfpack.poses.database import create_database, open_database
 from hyrfpack.poses.job import Job, chunks
 from hyrfpack.poses.watch import report_new_rows
 from hyrfpack.progress import Progress, TaskEvent
@@ -39,7 +39,7 @@ def find_features(job: Job, report_progress: Progress) -> dict[str, Any]:
         "sharpness" of each decodable photo by name, "unreadable" with the reason for each other photo, and "keypoints"
         with the number of features of each decodable photo.
     """
-    make_database(job)
+    create_database(job)
     facts_path = job.work / "features.json"
     facts: dict[str, Any] = {"sharpness": {}, "unreadable": {}}
     if facts_path.exists():
@@ -54,7 +54,9 @@ def find_features(job: Job, report_progress: Progress) -> dict[str, Any]:
 
     for camera, device in enumerate(job.devices, start=1):
         camera_photos = [
-            name for name, of in zip(job.names, job.device_of, strict=True) if of + 1 == camera and name not in known
+            name
+            for name, device_index in zip(job.names, job.device_indices, strict=True)
+            if device_index + 1 == camera and name not in known
         ]
         for names in chunks(camera_photos, _PHOTOS_PER_CHUNK):
             report_done(done)
@@ -63,14 +65,18 @@ def find_features(job: Job, report_progress: Progress) -> dict[str, Any]:
             with ThreadPoolExecutor(thread_count()) as pool:
                 write_copy = partial(_write_working_copy, job, folder, device.working_size)
                 copies = list(pool.map(write_copy, names, [numbers[name] for name in names]))
-            for name, (sharp, reason) in zip(names, copies, strict=True):
+            for name, (sharpness, reason) in zip(names, copies, strict=True):
                 if reason:
                     facts["unreadable"][name] = reason
                 else:
-                    facts["sharpness"][name] = sharp
+                    facts["sharpness"][name] = sharpness
             readable = [numbers[name] for name, (_, reason) in zip(names, copies, strict=True) if not reason]
-            first = done + len(names) - len(readable)
-            with report_new_rows(job, "keypoints", lambda found, first=first: report_done(first + found)):  # type: ignore[misc]
+            done_before = done + len(names) - len(readable)
+
+            def report_new(new: int, done_before: int = done_before) -> None:
+                report_done(done_before + new)
+
+            with report_new_rows(job, "keypoints", report_new):
                 _extract_features(job, folder, readable, camera)
             write_atomic(facts_path, json.dumps(facts).encode())
             done += len(names)
@@ -112,15 +118,15 @@ def _extract_features(job: Job, folder: Path, numbers: list[int], camera: int) -
     options.num_threads = thread_count()
     options.sift.max_num_features = _MAX_FEATURES_PER_PHOTO
     options.sift.first_octave = -1 if max(job.devices[camera - 1].working_size) <= _MAX_UPSAMPLED_SIDE_PIXELS else 0
-    reader = pycolmap.ImageReaderOptions()
-    reader.existing_camera_id = camera
+    reader_options = pycolmap.ImageReaderOptions()
+    reader_options.existing_camera_id = camera
     if (folder / "masks").is_dir():
-        reader.mask_path = folder / "masks"
+        reader_options.mask_path = folder / "masks"
     pycolmap.extract_features(
-        job.database,
+        job.database_path,
         folder / "photos",
         image_names=[job.working_name(number) for number in numbers],
         camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=reader,
+        reader_options=reader_options,
         extraction_options=options,
     )

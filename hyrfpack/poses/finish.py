@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 
 from hyrfpack.data.pictures import fit_size, read_pixels
-from hyrfpack.poses.choose import Candidate, choose_candidate, confirmed_photos, describe_doubt
+from hyrfpack.poses.choose import Candidate, choose_candidate, confirmed_photos, describe_unconfirmed_poses
 from hyrfpack.poses.database import open_database, verified_pairs
 from hyrfpack.poses.explained_matches import RayMatches, count_explained_matches
 from hyrfpack.poses.job import Job
@@ -46,22 +46,25 @@ def finish_reconstruction(job: Job, models: list[str], report_progress: Progress
         report_progress: see `run_stage`.
 
     Returns:
-        "registered", "sure" (confirmed by the other mapper) and "apart" (posed in another piece): names of photos.
-        "mapper", "why" and "doubt": the choice and sentences about it. "angle": the median over points of the largest
-        triangulation angle in degrees. If no photo is posed, only "registered", which is empty.
+        "registered", "sure" (confirmed by the other mapper) and "in_other_pieces" (posed in another piece): names of
+        photos. "mapper": the chosen mapper; "why": the reason; "warning": a sentence about poses that are not
+        confirmed, "" if enough are. "angle": the median over points of the largest triangulation angle in degrees. If
+        no photo is posed, only "registered", which is empty.
     """
     report_progress(TaskEvent("comparing both reconstructions", 0.0))
-    pieces = {name: read_pieces(job.model_folder(name)) for name in models}
-    pieces = {name: found for name, found in pieces.items() if found and found[0].num_reg_images() >= MIN_PIECE_PHOTOS}
-    if not pieces:
+    largest_pieces: dict[Candidate, pycolmap.Reconstruction] = {}
+    for name in models:
+        pieces = read_pieces(job.model_folder(name))
+        if pieces and pieces[0].num_reg_images() >= MIN_PIECE_PHOTOS:
+            largest_pieces[_make_candidate(job, name, pieces)] = pieces[0]
+    if not largest_pieces:
         return {"registered": []}
-    found = {_make_candidate(job, name, models): models[0] for name, models in pieces.items()}
     best: dict[str, Candidate] = {}  # the best result of each mapper
-    for candidate in sorted(found, key=lambda candidate: candidate.explained_matches):
+    for candidate in sorted(largest_pieces, key=lambda candidate: candidate.explained_matches):
         best[candidate.mapper] = candidate
     chosen, why = choose_candidate(list(best.values()), _count_matches(job))
     other = next((candidate for candidate in best.values() if candidate is not chosen), None)
-    model, poses, explained_count = found[chosen], chosen.poses, chosen.explained_matches
+    model, poses, explained_count = largest_pieces[chosen], chosen.poses, chosen.explained_matches
     steps: list[tuple[str, float, Callable[[pycolmap.Reconstruction], pycolmap.Reconstruction], float]] = [
         ("estimating poses of the remaining photos", 0.1, partial(complete_model, job), 1.0),
         ("triangulating points seen in two photos", 0.4, partial(add_two_view_points, job), 1.0),
@@ -72,8 +75,8 @@ def finish_reconstruction(job: Job, models: list[str], report_progress: Progress
             _MIN_REFITTED_MATCH_RATIO,
         ),
     ]
-    for doing, share, refine, min_match_ratio in steps:
-        report_progress(TaskEvent(doing, share))
+    for task, share, refine, min_match_ratio in steps:
+        report_progress(TaskEvent(task, share))
         refined = refine(model)
         refined_poses = read_poses(job, refined)
         refined_explained_count = count_explained_matches(refined_poses, _read_ray_matches(job, refined))
@@ -82,14 +85,14 @@ def finish_reconstruction(job: Job, models: list[str], report_progress: Progress
     _rescale_to_photos(job, model)
     _color_points(job, model, report_progress)
     _save_chosen(job, model)
-    apart = {name for candidate in best.values() for piece in candidate.other_pieces for name in piece}
+    in_other_pieces = {name for candidate in best.values() for piece in candidate.other_pieces for name in piece}
     return {
         "registered": sorted(poses),
         "sure": sorted(confirmed_photos(poses, other)),
-        "apart": sorted(apart - set(poses)),
+        "in_other_pieces": sorted(in_other_pieces - set(poses)),
         "mapper": chosen.mapper,
         "why": why,
-        "doubt": describe_doubt(poses, other),
+        "warning": describe_unconfirmed_poses(poses, other),
         "angle": _median_triangulation_angle(model),
     }
 

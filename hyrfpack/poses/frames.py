@@ -93,7 +93,11 @@ class _VideoMeasurement:
 
 
 def choose_frames(
-    video: StrPath, folder: StrPath, *, most: int = _DEFAULT_MAX_TAKEN_FRAMES, progress: Progress = ignore_progress
+    video: StrPath,
+    folder: StrPath,
+    *,
+    max_frames: int = _DEFAULT_MAX_TAKEN_FRAMES,
+    progress: Progress = ignore_progress,
 ) -> FrameReport:
     """Choose sharp, evenly spaced frames of a video and write them as photos.
 
@@ -109,13 +113,13 @@ def choose_frames(
     Args:
         video: a video file that FFmpeg can read. High dynamic range is tone mapped to sRGB.
         folder: output folder; created if missing. Only frames of an earlier call are removed from it.
-        most: maximum number of frames to take.
+        max_frames: maximum number of frames to take.
         progress: called with `TaskEvent`s.
 
     Raises:
         HyrfDataError: the file is missing or is no video, or too few frames can be decoded, are sharp, or differ.
         HyrfError: PyAV is not installed, or the frames cannot be written.
-        ValueError: `most` is below 5.
+        ValueError: `max_frames` is below 5.
 
     Example:
         >>> from hyrfpack.poses.frames import choose_frames
@@ -123,19 +127,20 @@ def choose_frames(
         >>> f"{report.taken} of {report.of} frames"  # doctest: +SKIP
         '112 of 1843 frames'
     """
-    if most < _MIN_TAKEN_FRAMES:
-        raise ValueError(f"most must be {_MIN_TAKEN_FRAMES} or more, not {most}")
+    if max_frames < _MIN_TAKEN_FRAMES:
+        raise ValueError(f"max_frames must be {_MIN_TAKEN_FRAMES} or more, not {max_frames}")
     video, folder = Path(video), Path(folder)
     with open_video(video) as source:
-        key = {"video": video.name, "bytes": video.stat().st_size, "modified": video.stat().st_mtime_ns, "most": most}
+        status = video.stat()
+        key = {"video": video.name, "bytes": status.st_size, "modified": status.st_mtime_ns, "most": max_frames}
         record = _read_record(folder)
         if record is None or record["key"] != key:
             measured = _measure_video(video, source, progress)
-            chosen, found = _choose_spaced_frames(video, measured, most, progress)
+            chosen, report = _choose_spaced_frames(video, measured, max_frames, progress)
             _remove_frames(folder, record)
             make_folder(folder)
             times = {_frame_name(number): seconds for number, seconds in chosen.items()}
-            record = {"key": key, "frames": list(chosen), "times": times, "report": asdict(found)}
+            record = {"key": key, "frames": list(chosen), "times": times, "report": asdict(report)}
             write_atomic(folder / RECORD_NAME, json.dumps(record).encode())
         _write_frames(source, folder, record["frames"], progress)
     progress(TaskEvent("frames written", 1.0))
@@ -155,16 +160,13 @@ def survey_frames(video: StrPath, progress: Progress = ignore_progress) -> tuple
         HyrfDataError: see `choose_frames`.
 
     Example:
-        >>> report, size, looked_at = survey_frames("clip.mp4")  # doctest: +SKIP
+        >>> report, size, measured_count = survey_frames("clip.mp4")  # doctest: +SKIP
     """
     video = Path(video)
     with open_video(video) as source:
         measured = _measure_video(video, source, progress)
-        return (
-            _choose_spaced_frames(video, measured, _DEFAULT_MAX_TAKEN_FRAMES, progress)[1],
-            source.size,
-            len(measured.numbers) + measured.repeated_count,
-        )
+        _, report = _choose_spaced_frames(video, measured, _DEFAULT_MAX_TAKEN_FRAMES, progress)
+        return report, source.size, len(measured.numbers) + measured.repeated_count
 
 
 def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasurement:
@@ -172,30 +174,30 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
     step = max(1 / _MAX_MEASURED_FRAMES_PER_SECOND, video.seconds / _MAX_MEASURED_FRAMES)
     numbers: list[int] = []
     times: list[float] = []
-    sharp: list[float] = []
+    sharpness: list[float] = []
     thumbnails: list[np.ndarray] = []
     notes: list[str] = []
-    decoded_count, repeated_count, time, last, longest = 0, 0, 0.0, -np.inf, 0.0
+    decoded_count, repeated_count, time, last_measured, longest = 0, 0, 0.0, -np.inf, 0.0
     interlaced = changes_size = False
     for number, start, frame in video.frames():
         longest, time = max(longest, start - time), start
         decoded_count = number + 1
         interlaced = interlaced or bool(frame.interlaced_frame)
-        if time - last < step * 0.98 and time > last:
+        if time - last_measured < step * 0.98 and time > last_measured:
             continue
-        last = time
+        last_measured = time
         gray = decode_gray(frame, _SHARPNESS_SIDE_PIXELS)
         scale = TRACKING_SIDE_PIXELS / max(gray.shape)
         size = (max(8, round(gray.shape[1] * scale)), max(8, round(gray.shape[0] * scale)))
         thumbnail = np.asarray(Image.fromarray(gray).resize(size, Image.Resampling.BOX))
         if thumbnails and thumbnails[-1].shape != thumbnail.shape:
             changes_size = True
-            notes.append(f"the picture changes its size after {time:.0f} s; what follows was not used")
+            notes.append(f"the picture changes its size after {time:.0f} s; the frames after that are not used")
             break
         if thumbnails and np.abs(thumbnail.astype(np.int16) - thumbnails[-1]).mean() < _MAX_REPEAT_DIFFERENCE_LEVELS:
             repeated_count += 1
         else:
-            sharp.append(measure_sharpness(gray.astype(np.float32) / 255))
+            sharpness.append(measure_sharpness(gray.astype(np.float32) / 255))
             thumbnails.append(thumbnail)
             numbers.append(number)
             times.append(time)
@@ -203,25 +205,22 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
         share = min(1.0, time / video.seconds) if video.seconds else 0.0
         progress(TaskEvent(f"measuring frame {decoded_count}, {time:.0f} s{length}", _MEASURED_PROGRESS * share))
     if decoded_count < _MIN_DECODED_FRAMES:
-        can_be_decoded, copy_or = (
-            (" that can be decoded", "copy it again in full, or ") if video.damaged_count else ("", "")
-        )
-        raise HyrfDataError(
-            f"{path}: the video has only {format_count(decoded_count, 'frame')}{can_be_decoded}",
-            fix=f"{copy_or}film for at least ten seconds",
-        )
-    # The last frame is shown for some time, too.
+        problem, fix = f"the video has only {format_count(decoded_count, 'frame')}", "film for at least ten seconds"
+        if video.damaged_count:
+            problem, fix = f"{problem} that can be decoded", f"copy it again in full, or {fix}"
+        raise HyrfDataError(f"{path}: {problem}", fix=fix)
+    # The last frame is shown for some time too, which is estimated by the longest time between two frames.
     if video.damaged_count or (not changes_size and time + longest < _MIN_DURATION_RATIO * video.seconds):
         notes.append(
             f"the video is damaged or cut off: {decoded_count} frames of {time:.1f} s could be read, of "
             f"{video.seconds:.1f} s that it should have; copy it again if there is more"
         )
     if interlaced:
-        notes.append("the video is interlaced, which combs what moves; film progressively (p, not i) if you can")
+        notes.append("the video is interlaced, so moving edges look like combs; record progressive video (p, not i)")
     return _VideoMeasurement(
         np.array(numbers),
         np.array(times),
-        np.array(sharp),
+        np.array(sharpness),
         thumbnails,
         decoded_count,
         repeated_count,
@@ -231,7 +230,7 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
 
 
 def _choose_spaced_frames(
-    path: Path, measured: _VideoMeasurement, most: int, progress: Progress
+    path: Path, measured: _VideoMeasurement, max_frames: int, progress: Progress
 ) -> tuple[dict[int, float], FrameReport]:
     """Return the frames to take, as number -> time in seconds, and the report about them."""
     blurred = is_blurred(measured.sharpness)
@@ -240,38 +239,25 @@ def _choose_spaced_frames(
             f"{path}: all frames of the video are blurred",
             fix="film again, slower and with more light",
         )
-    sharp = np.flatnonzero(~blurred)
-    thumbnails = [measured.thumbnails[index] for index in sharp]
+    sharp_indices = np.flatnonzero(~blurred)
+    thumbnails = [measured.thumbnails[index] for index in sharp_indices]
     trajectories = track_windows(thumbnails, part_of_progress(progress, _MEASURED_PROGRESS, _TRACKED_PROGRESS))
-    values = measured.sharpness[sharp]
-    spacing = _DEFAULT_SPACING_RATIO
-    picked = _pick_sharpest_frames(trajectories, values, spacing)
-    wanted = min(_TARGET_FRAMES, most)
-    if len(picked) > most:
-        spacing, picked = _bisect_spacing(trajectories, values, most, spacing, 2.0 * len(sharp) * spacing)
-    elif len(picked) < wanted:
-        closest = _pick_sharpest_frames(trajectories, values, _MIN_SPACING_RATIO)
-        spacing, picked = (
-            (_MIN_SPACING_RATIO, closest)
-            if len(closest) <= wanted
-            else _bisect_spacing(trajectories, values, wanted, _MIN_SPACING_RATIO, spacing)
-        )
+    picked = _pick_frames_in_limits(trajectories, measured.sharpness[sharp_indices], max_frames)
     if len(picked) < _MIN_TAKEN_FRAMES:
         raise HyrfDataError(
             f"{path}: the camera hardly moves, so that only {len(picked)} of {measured.decoded_count} frames can "
             f"serve as photos, but at least {_MIN_TAKEN_FRAMES} are needed",
             fix="walk around what you film",
         )
-    steps = np.array(
-        [motion_distances(trajectories, a, slice(b, b + 1))[0] for a, b in zip(picked, picked[1:], strict=False)]
-    )
+    spacings = [motion_distances(trajectories, a, slice(b, b + 1))[0] for a, b in zip(picked, picked[1:], strict=False)]
+    median_spacing = float(np.median(spacings))
     notes = list(measured.notes)
-    if np.median(steps) > _MAX_MATCHABLE_SPACING_RATIO:
+    if median_spacing > _MAX_MATCHABLE_SPACING_RATIO:
         notes.append(
-            f"the taken frames are {np.median(steps):.0%} of the picture apart, so far that matching may fail; "
+            f"the taken frames are {median_spacing:.0%} of the picture apart, so far that matching may fail; "
             "take more frames, film slower, or cut the video into pieces"
         )
-    taken = sharp[picked]
+    taken = sharp_indices[picked]
     seconds = [round(time, 3) for time in measured.times[taken].tolist()]
     return dict(zip(measured.numbers[taken].tolist(), seconds, strict=True)), FrameReport(
         taken=len(picked),
@@ -279,27 +265,45 @@ def _choose_spaced_frames(
         blurred=int(blurred.sum()),
         repeated=measured.repeated_count,
         seconds=round(measured.seconds, 3),
-        spacing=round(float(np.median(steps)), 4),
+        spacing=round(median_spacing, 4),
         notes=tuple(notes),
     )
 
 
+def _pick_frames_in_limits(trajectories: np.ndarray, sharpness: np.ndarray, max_frames: int) -> list[int]:
+    """Pick frames at the default spacing, or at another one if these are too many or too few."""
+    picked = _pick_sharpest_frames(trajectories, sharpness, _DEFAULT_SPACING_RATIO)
+    min_frames = min(_TARGET_FRAMES, max_frames)
+    if len(picked) > max_frames:
+        max_spacing = 2.0 * len(sharpness) * _DEFAULT_SPACING_RATIO
+        return _bisect_spacing(trajectories, sharpness, max_frames, _DEFAULT_SPACING_RATIO, max_spacing)
+    if len(picked) < min_frames:
+        closest = _pick_sharpest_frames(trajectories, sharpness, _MIN_SPACING_RATIO)
+        if len(closest) <= min_frames:
+            return closest
+        return _bisect_spacing(trajectories, sharpness, min_frames, _MIN_SPACING_RATIO, _DEFAULT_SPACING_RATIO)
+    return picked
+
+
 def _bisect_spacing(
-    trajectories: np.ndarray, sharp: np.ndarray, most: int, low: float, high: float
-) -> tuple[float, list[int]]:
-    """Bisect between two spacings for the smallest one that takes at most `most` frames; return it and these frames."""
+    trajectories: np.ndarray, sharpness: np.ndarray, max_frames: int, low: float, high: float
+) -> list[int]:
+    """Pick frames at the smallest spacing between `low` and `high` at which they are at most `max_frames`."""
     for _ in range(12):
         middle = (low * high) ** 0.5
-        low, high = (middle, high) if len(_pick_sharpest_frames(trajectories, sharp, middle)) > most else (low, middle)
-    return high, _pick_sharpest_frames(trajectories, sharp, high)
+        if len(_pick_sharpest_frames(trajectories, sharpness, middle)) > max_frames:
+            low = middle
+        else:
+            high = middle
+    return _pick_sharpest_frames(trajectories, sharpness, high)
 
 
-def _pick_sharpest_frames(trajectories: np.ndarray, sharp: np.ndarray, spacing: float) -> list[int]:
+def _pick_sharpest_frames(trajectories: np.ndarray, sharpness: np.ndarray, spacing: float) -> list[int]:
     """Pick the sharpest frame near the start, then repeatedly the sharpest one about `spacing` from the last pick.
 
     Args:
         trajectories: (N, windows, 2) displacements, from `track_windows`.
-        sharp: (N,) sharpness.
+        sharpness: (N,) sharpness of each frame.
         spacing: wanted motion between two picks, as a ratio of the longer side.
 
     Returns:
@@ -307,9 +311,9 @@ def _pick_sharpest_frames(trajectories: np.ndarray, sharp: np.ndarray, spacing: 
     """
     picked: list[int] = []
     base, begin, low, high = 0, 0, 0.0, 0.5 * spacing
-    while begin < len(sharp):
+    while begin < len(sharpness):
         first = stop = None
-        for start in range(begin, len(sharp), 64):
+        for start in range(begin, len(sharpness), 64):
             moved = motion_distances(trajectories, base, slice(start, start + 64))
             if first is None and (moved >= low).any():
                 first = start + int((moved >= low).argmax())
@@ -320,8 +324,8 @@ def _pick_sharpest_frames(trajectories: np.ndarray, sharp: np.ndarray, spacing: 
                     break
         if first is None:
             break
-        stop = max(first + 1, len(sharp) if stop is None else stop)
-        base = first + int(sharp[first:stop].argmax())
+        stop = max(first + 1, len(sharpness) if stop is None else stop)
+        base = first + int(sharpness[first:stop].argmax())
         picked.append(base)
         begin, low, high = base + 1, 0.75 * spacing, 1.25 * spacing
     return picked
@@ -332,17 +336,16 @@ def _write_frames(video: Video, folder: Path, numbers: list[int], progress: Prog
     missing = {number for number in numbers if not (folder / _frame_name(number)).is_file()}
     if not missing:
         return
-    left = len(missing)
-    last = max(missing)
+    count, last = len(missing), max(missing)
     for number, _, frame in video.frames():
         if number in missing:
             data = io.BytesIO()
             decode_upright(frame, video.aspect).save(data, "JPEG", quality=95, subsampling=0)
             write_atomic(folder / _frame_name(number), data.getvalue())
             missing.remove(number)
-        written = f"writing frames {left - len(missing)}/{left}"
+        task = f"writing frames {count - len(missing)}/{count}"
         share = min((number + 1) / (last + 1), 1.0)
-        progress(TaskEvent(written, _TRACKED_PROGRESS + (1 - _TRACKED_PROGRESS) * share))
+        progress(TaskEvent(task, _TRACKED_PROGRESS + (1 - _TRACKED_PROGRESS) * share))
         if not missing:
             break
 

@@ -48,7 +48,7 @@ class Job:
         work: folder of intermediate products.
         names: photo names, sorted; image n of the database is names[n - 1].
         devices: cameras; camera n of the database is devices[n - 1].
-        device_of: for each photo, an index into `devices`.
+        device_indices: index of each photo's camera in `devices`.
         masks: path of the mask by photo name, for photos that have one.
         matching: "exhaustive", "sequential" or "retrieval".
         seed: random seed.
@@ -58,18 +58,18 @@ class Job:
     work: Path
     names: tuple[str, ...]
     devices: tuple[Device, ...]
-    device_of: tuple[int, ...]
+    device_indices: tuple[int, ...]
     masks: dict[str, str]
     matching: str
     seed: int
 
     @property
-    def database(self) -> Path:
+    def database_path(self) -> Path:
         """Return the path of pycolmap's database of features and matches."""
         return self.work / "database.db"
 
     @property
-    def matches(self) -> Path:
+    def matches_path(self) -> Path:
         """Return the path of the answer of the stage that matches photos, see `matching.match_photos`."""
         return self.work / "matches.json"
 
@@ -96,7 +96,7 @@ class Job:
         values = json.loads(path.read_text())
         devices = tuple(Device(tuple(device["size"]), device["focal"]) for device in values["devices"])
         folders = {"images": Path(values["images"]), "work": Path(values["work"])}
-        lists = {key: tuple(values[key]) for key in ("names", "device_of")}
+        lists = {key: tuple(values[key]) for key in ("names", "device_indices")}
         return Job(**{**values, **folders, **lists, "devices": devices})
 
 

@@ -50,7 +50,7 @@ def map_globally(job: Job, report_progress: Progress) -> dict[str, Any]:
 
 
 def repeat_mapping(job: Job, report_progress: Progress) -> dict[str, Any]:
-    """Run the global mapper again from other starts, and the incremental mapper if focal lengths change by that.
+    """Run the global mapper again from other random positions, and the incremental mapper if focal lengths change.
 
     Verified pairs depend on the focal length they were verified with, and the resulting focal length depends on the
     verified pairs. So the pairs are verified again if a run changes the focal length. Each run starts from other random
@@ -81,14 +81,14 @@ def _global_name(run_index: int) -> str:
 
 
 def _run_global_mapper(job: Job, run_index: int, stage: str, report_progress: Progress) -> bool:
-    """Run the global mapper with the start `run_index`, unless its result exists.
+    """Run the global mapper with the random positions of run `run_index`, unless its result exists.
 
     If the run changes a focal length, the pairs are verified again with it, except after the last run.
 
     Args:
         job: the estimation.
-        run_index: index of the start.
-        stage: name of the stage, into whose log the library writes.
+        run_index: index of the run, which determines its random positions.
+        stage: name of the stage, into whose log pycolmap writes.
         report_progress: called with `TaskEvent`s, whose share is that of this run.
 
     Returns:
@@ -96,17 +96,17 @@ def _run_global_mapper(job: Job, run_index: int, stage: str, report_progress: Pr
     """
     name = _global_name(run_index)
     if not job.model_folder(name).exists():
-        doing = f"global mapping, run {run_index + 1}/{_GLOBAL_RUNS}" if run_index else "global mapping"
-        report_progress(TaskEvent(doing, 0.0))
+        task = f"global mapping, run {run_index + 1}/{_GLOBAL_RUNS}" if run_index else "global mapping"
+        report_progress(TaskEvent(task, 0.0))
         seed, options = (job.seed + run_index) % 2**31, pycolmap.GlobalPipelineOptions()
         options.random_seed = options.mapper.random_seed = seed
         options.num_threads = options.mapper.num_threads = SOLVER_THREADS
         options.mapper.global_positioning.random_seed = options.mapper.rotation_averaging.random_seed = seed
         options.min_num_matches, options.min_model_size = MIN_PAIR_MATCHES, MIN_PIECE_PHOTOS
         log, report_mapping = job.work / f"{stage}.log", part_of_progress(report_progress, 0.0, 0.8)
-        with _info_log_level(), report_global_mapping_phase(log, doing, report_mapping):
-            found = pycolmap.global_mapping(job.database, job.images, _make_scratch_folder(job), options)
-        _save_pieces(job, name, found)
+        with _info_log_level(), report_global_mapping_phase(log, task, report_mapping):
+            mapped = pycolmap.global_mapping(job.database_path, job.images, _make_scratch_folder(job), options)
+        _save_pieces(job, name, mapped)
     pieces = read_pieces(job.model_folder(name))
     if not pieces or run_index == _GLOBAL_RUNS - 1:
         return False
@@ -116,13 +116,13 @@ def _run_global_mapper(job: Job, run_index: int, stage: str, report_progress: Pr
 
 @contextmanager
 def _info_log_level() -> Iterator[None]:
-    """Let the library write the phases of its work into the log while the block runs."""
-    before = pycolmap.logging.minloglevel
+    """Let pycolmap write the phases of its work into the log while the block runs."""
+    previous_level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = 0
     try:
         yield
     finally:
-        pycolmap.logging.minloglevel = before
+        pycolmap.logging.minloglevel = previous_level
 
 
 def map_incrementally(job: Job, report_progress: Progress) -> dict[str, Any]:
@@ -137,7 +137,7 @@ def map_incrementally(job: Job, report_progress: Progress) -> dict[str, Any]:
     """
     name = _run_incremental_mapper(job, 0, report_progress)
     first, second = (_read_result(job, result) for result in (_global_name(0), name))
-    matched = json.loads(job.matches.read_text())["matched"]
+    matched = json.loads(job.matches_path.read_text())["matched"]
     return {"models": [name], "agrees": confirm_each_other(first, second, len(matched))}
 
 
@@ -165,7 +165,7 @@ def _run_incremental_mapper(job: Job, run_index: int, report_progress: Progress)
         count = len(job.names)
         report_progress(TaskEvent(f"incremental mapping, choosing the first 2/{count} photos", 0.0))
         pieces = pycolmap.incremental_mapping(
-            job.database,
+            job.database_path,
             job.images,
             _make_scratch_folder(job),
             options,
@@ -202,7 +202,7 @@ def complete_model(job: Job, model: pycolmap.Reconstruction) -> pycolmap.Reconst
     options.random_seed, options.num_threads = job.seed % 2**31, SOLVER_THREADS
     options.min_num_matches = MIN_PAIR_MATCHES
     options.multiple_models = options.extract_colors = False
-    pieces = pycolmap.incremental_mapping(job.database, job.images, scratch, options, input_path=start)
+    pieces = pycolmap.incremental_mapping(job.database_path, job.images, scratch, options, input_path=start)
     shutil.rmtree(start, ignore_errors=True)
     return max(pieces.values(), key=lambda piece: piece.num_reg_images(), default=model)
 
@@ -216,7 +216,7 @@ def add_two_view_points(job: Job, model: pycolmap.Reconstruction) -> pycolmap.Re
     options.extract_colors = False
     return pycolmap.triangulate_points(
         pycolmap.Reconstruction(model),
-        job.database,
+        job.database_path,
         job.images,
         _make_scratch_folder(job),
         clear_points=False,
@@ -242,15 +242,16 @@ def _select_better_cameras(model: pycolmap.Reconstruction, cameras: Cameras) -> 
     """Select the cameras of a model whose focal length is plausible and differs from the current one."""
     better = {}
     for number, camera in model.cameras.items():
-        focal, longer = camera.focal_length, max(camera.width, camera.height)
-        likely = _MIN_FOCAL_RATIO < focal / longer < _MAX_FOCAL_RATIO and not camera.has_bogus_params(0.1, 10.0, 1.0)
-        if likely and abs(focal / cameras[number].focal_length - 1) > _MAPPED_FOCAL_CHANGE_RATIO:
+        focal, longer_side = camera.focal_length, max(camera.width, camera.height)
+        is_in_limits = _MIN_FOCAL_RATIO < focal / longer_side < _MAX_FOCAL_RATIO
+        is_plausible = is_in_limits and not camera.has_bogus_params(0.1, 10.0, 1.0)
+        if is_plausible and abs(focal / cameras[number].focal_length - 1) > _MAPPED_FOCAL_CHANGE_RATIO:
             better[number] = camera
     return better
 
 
 def _make_scratch_folder(job: Job) -> Path:
-    """Create an empty folder for temporary files, and remove an earlier one."""
+    """Create an empty folder for temporary files, in place of an earlier one."""
     folder = job.work / "scratch"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()

@@ -31,7 +31,7 @@ from hyrfpack.poses.job import Job
 from hyrfpack.poses.watch import report_new_rows
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 
-# The library keeps the search index of so many photos in memory, about 2 MB each, and builds the others again.
+# pycolmap keeps the search indices of this many photos in memory, about 2 MB each, and rebuilds those of the others.
 _MAX_CACHED_PHOTOS = 256
 # The focal length of a camera is estimated from pairs of its photos with many matches.
 _MIN_FOCAL_PAIR_MATCHES = 2 * MIN_PAIR_MATCHES
@@ -52,8 +52,8 @@ def match_photos(job: Job, report_progress: Progress) -> dict[str, Any]:
         "pairs": the number of verified pairs; "matched": names of the photos in them; "turned": the share of pairs
         between which the camera only rotated, near 1 for photos from one place.
     """
-    if job.matches.exists():
-        return json.loads(job.matches.read_text())
+    if job.matches_path.exists():
+        return json.loads(job.matches_path.read_text())
     if not (job.work / "focal.json").exists():  # focal lengths are estimated after all pairs are matched
         _match_pairs(job, _choose_pairs(job, report_progress), report_progress)
 
@@ -62,7 +62,7 @@ def match_photos(job: Job, report_progress: Progress) -> dict[str, Any]:
     recalibrate(job, "focal", lambda cameras: _estimate_focals(job, cameras, report_part), report_part)
     report_progress(TaskEvent("checking that the camera moved", 0.95))
     answer = _summarize_matches(job)
-    write_atomic(job.matches, json.dumps(answer).encode())
+    write_atomic(job.matches_path, json.dumps(answer).encode())
     return answer
 
 
@@ -72,11 +72,13 @@ def _choose_pairs(job: Job, report_progress: Progress) -> pairing.Pairs:
     if job.matching == "exhaustive":
         return pairing.exhaustive_pairs(count)
     with open_database(job) as database:
-        found = []
-        for number in range(1, count + 1):
-            there = database.exists_descriptors(number)
-            found.append(database.read_descriptors(number).data if there else np.zeros((0, 128), np.uint8))
-    similarity = pairing.compute_similarities(found, job.seed, part_of_progress(report_progress, 0.0, 0.02))
+        descriptors = [
+            database.read_descriptors(number).data
+            if database.exists_descriptors(number)
+            else np.zeros((0, 128), np.uint8)
+            for number in range(1, count + 1)
+        ]
+    similarity = pairing.compute_similarities(descriptors, job.seed, part_of_progress(report_progress, 0.0, 0.02))
     choose = pairing.sequential_pairs if job.matching == "sequential" else pairing.retrieval_pairs
     return choose(count, similarity)
 
@@ -96,8 +98,8 @@ def _match_pairs(job: Job, pairs: pairing.Pairs, report_progress: Progress) -> N
     remaining = [pair for pair in matchable if pair not in matched]
     done = len(matchable) - len(remaining)
 
-    def report_new(found: int) -> None:
-        number, share = min(done + found + 1, len(matchable)), min((done + found) / len(matchable), 1.0)
+    def report_new(new: int) -> None:
+        number, share = min(done + new + 1, len(matchable)), min((done + new) / len(matchable), 1.0)
         report_progress(TaskEvent(f"matching pair {number}/{len(matchable)}", 0.02 + 0.8 * share))
 
     if remaining:
@@ -110,7 +112,7 @@ def _match_pairs(job: Job, pairs: pairing.Pairs, report_progress: Progress) -> N
         matching_options = pycolmap.FeatureMatchingOptions()
         matching_options.num_threads = thread_count()
         with report_new_rows(job, "two_view_geometries", report_new):
-            pycolmap.match_image_pairs(job.database, matching_options, options, verification_options(job.seed))
+            pycolmap.match_image_pairs(job.database_path, matching_options, options, verification_options(job.seed))
         list_path.unlink()
 
 
@@ -119,22 +121,22 @@ def _estimate_focals(
 ) -> dict[int, pycolmap.Camera]:
     """Estimate focal lengths that EXIF lacks; return the cameras whose focal length differs from the guess."""
     with open_database(job) as database:
-        strong = _sample_strong_pairs(job, database)
-    found: dict[int, float] = {}
+        strong_pairs = _sample_strong_pairs(job, database)
+    focal_ratios: dict[int, float] = {}
     count = len(job.devices)
     for number, device in enumerate(job.devices, start=1):
-        camera_pairs = strong.get(number, [])
+        camera_pairs = strong_pairs.get(number, [])
         if device.focal is None and len(camera_pairs) >= _MIN_FOCAL_PAIRS:
             report_search = part_of_progress(report_progress, 0.5 * (number - 1) / count, 0.5 * number / count)
             task = f"{FOCAL_SEARCH_TASK}, camera {number}/{count}" if count > 1 else FOCAL_SEARCH_TASK
-            found[number] = search_focal_ratio(camera_pairs, cameras[number], job.seed, report_search, task)
-    typical = float(np.median(list(found.values()))) if found else None
+            focal_ratios[number] = search_focal_ratio(camera_pairs, cameras[number], job.seed, report_search, task)
+    typical_ratio = float(np.median(list(focal_ratios.values()))) if focal_ratios else None
     better = {}
     for number, device in enumerate(job.devices, start=1):
-        if device.focal is None and typical is not None:
-            now = camera_with_focal(cameras[number], found.get(number, typical))
-            if abs(now.focal_length / cameras[number].focal_length - 1) > _ESTIMATED_FOCAL_CHANGE_RATIO:
-                better[number] = now
+        if device.focal is None and typical_ratio is not None:
+            estimated = camera_with_focal(cameras[number], focal_ratios.get(number, typical_ratio))
+            if abs(estimated.focal_length / cameras[number].focal_length - 1) > _ESTIMATED_FOCAL_CHANGE_RATIO:
+                better[number] = estimated
     return better
 
 
@@ -143,8 +145,8 @@ def _sample_strong_pairs(job: Job, database: pycolmap.Database) -> dict[int, lis
     rng = np.random.default_rng(job.seed)
     candidates_of: dict[int, list[tuple[int, int, np.ndarray]]] = {}
     for first, second, matches in verified_pairs(database):
-        device = job.device_of[first - 1] + 1
-        if len(matches) >= _MIN_FOCAL_PAIR_MATCHES and job.device_of[second - 1] + 1 == device:
+        device = job.device_indices[first - 1] + 1
+        if len(matches) >= _MIN_FOCAL_PAIR_MATCHES and job.device_indices[second - 1] + 1 == device:
             candidates_of.setdefault(device, []).append((first, second, matches))
     chosen = {}
     for device, candidates in candidates_of.items():
@@ -160,17 +162,18 @@ def _read_pixel_matches(database: pycolmap.Database, first: int, second: int, ma
 
 
 def _summarize_matches(job: Job) -> dict[str, Any]:
-    """Return the answer of this stage, see `match_photos`."""
+    """Count the verified pairs and estimate the share without translation; return the answer of `match_photos`."""
     with open_database(job) as database:
         pairs = [(first, second) for first, second, _ in verified_pairs(database)]
-        cameras, strong = read_cameras(database), _sample_strong_pairs(job, database)
-    turned, counted = 0.0, 0
-    for number, camera_pairs in strong.items():
+        cameras, strong_pairs = read_cameras(database), _sample_strong_pairs(job, database)
+    rotation_only_count, sampled_count = 0.0, 0
+    for number, camera_pairs in strong_pairs.items():
         camera, has_focal = cameras[number], job.devices[number - 1].focal is not None
         focals = (
             [camera.focal_length / max(camera.width, camera.height)] if has_focal else list(CANDIDATE_FOCAL_RATIOS[:13])
         )
-        turned += rotation_only_share(camera_pairs, camera, focals) * len(camera_pairs)
-        counted += len(camera_pairs)
+        rotation_only_count += rotation_only_share(camera_pairs, camera, focals) * len(camera_pairs)
+        sampled_count += len(camera_pairs)
     matched = sorted({job.names[number - 1] for pair in pairs for number in pair})
-    return {"pairs": len(pairs), "matched": matched, "turned": turned / counted if counted else 0.0}
+    turned = rotation_only_count / sampled_count if sampled_count else 0.0
+    return {"pairs": len(pairs), "matched": matched, "turned": turned}

@@ -49,7 +49,7 @@ class SceneOutput:
     def check_paths(self, photos: Path) -> None:
         """Check both paths. Raises HyrfError: the photos do not exist, or a file has the name of the scene's folder."""
         if not photos.exists():
-            raise HyrfDataError(f"{photos}: there is no such folder or video", fix="name the one that holds the photos")
+            raise HyrfDataError(f"{photos}: there is no such folder or video", fix="name the folder or the video")
         if os.path.lexists(self.scene) and not self.scene.is_dir():
             raise HyrfError(f"{self.scene}: this is a file", fix="name a folder for the scene")
 
@@ -78,33 +78,33 @@ class SceneOutput:
                 )
             if (foreign := find_foreign_model_file(self.scene, report)) is not None:
                 raise HyrfError(
-                    f"{self.scene / foreign}: this file would be removed, and no estimation of poses wrote it",
+                    f"{self.scene / foreign}: this file would be removed, but no estimation of poses wrote it",
                     fix="move it elsewhere, or name another folder",
                 )
         if not is_same_path(photos, self.scene) and any(name.lower().endswith(PICTURE_SUFFIXES) for name in names):
-            raise HyrfError(f"{self.scene}: photos lie in this folder", fix="name another for the scene")
+            raise HyrfError(f"{self.scene}: this folder holds photos", fix="name another folder for the scene")
         check_writable(self.scene)
 
     def check_free(self, name: str) -> None:
         """Check a sub-folder. Raises HyrfError: it has files that no estimation wrote, or that this one reads."""
         folder = self.scene / name
-        ours = {
-            owned: size
-            for owned, size in self.owned_files().items()
+        removable = {
+            owned: state
+            for owned, state in self.owned_files().items()
             if self.scene.resolve() / owned not in self.protected
         }
-        if os.path.lexists(folder) and not has_only(self.scene, name, ours):
+        if os.path.lexists(folder) and not has_only(self.scene, name, removable):
             raise HyrfError(
                 f"{folder}: the folder holds files that do not belong to these photos",
                 fix=f"choose another folder for the scene, or give {self.scene} as the folder of the photos, too",
             )
 
     def protect(self, files: Collection[Path]) -> None:
-        """Declare the files that the estimation reads, which are then never removed."""
+        """Protect the files that the estimation reads from being removed."""
         self.protected = frozenset(path.resolve() for path in files)
 
     def claim_work_folder(self, settings: list[Any]) -> bool:
-        """Create the folder of products in progress, or take over that of an interrupted call.
+        """Create the folder of products in progress, or take over the folder of an interrupted call.
 
         Args:
             settings: plain values of all settings that affect the products.
@@ -205,7 +205,7 @@ def is_same_path(first: Path, second: Path) -> bool:
 
 @contextmanager
 def explain_disk_errors(out: Path) -> Iterator[None]:
-    """Convert disk errors in the block into a HyrfError of one sentence."""
+    """Convert errors of the disk and of permissions in the block into a HyrfError."""
     try:
         yield
     except OSError as error:
@@ -216,10 +216,10 @@ def explain_disk_errors(out: Path) -> Iterator[None]:
             ) from error
         if isinstance(error, FileNotFoundError):
             raise HyrfError(
-                f"{error.filename or out}: was removed or moved meanwhile",
+                f"{error.filename or out}: this file or folder was removed or moved during the estimation",
                 fix="put it back and run the same command again",
             ) from error
         raise HyrfError(
-            f"{error.filename or out}: cannot be read or written ({error.strerror or error})",
+            f"{error.filename or out}: this file or folder cannot be read or written ({error.strerror or error})",
             fix="check the folder's permissions and the disk",
         ) from error

@@ -63,15 +63,15 @@ def unchanged_files(scene: Path, owned: Any) -> OwnedFiles:
     The record is not trusted: it may be forged, or come from another folder. Files outside OWNED_FOLDERS of the scene
     are never returned.
     """
-    found: OwnedFiles = {}
+    unchanged: OwnedFiles = {}
     root = scene.resolve()
     for name, state in owned.items() if isinstance(owned, dict) else ():
         path = scene / name
         with suppress(OSError, TypeError, ValueError):
             inside = path.resolve() == root / name and name.split("/")[0] in OWNED_FOLDERS
             if inside and path.is_file() and _is_unchanged(path, state):
-                found[name] = state
-    return found
+                unchanged[name] = state
+    return unchanged
 
 
 def find_foreign_model_file(scene: Path, report: dict[str, Any]) -> str | None:

@@ -58,13 +58,13 @@ def retrieval_pairs(count: int, similarity: np.ndarray) -> Pairs:
     return sorted(neighbours | _most_similar_pairs(similarity, similar))
 
 
-def _most_similar_pairs(similarity: np.ndarray, most: int, min_distance: int = 1) -> set[tuple[int, int]]:
-    """Pair each photo with at most `most` of the highest finite similarity, at least `min_distance` places away."""
+def _most_similar_pairs(similarity: np.ndarray, max_partners: int, min_distance: int = 1) -> set[tuple[int, int]]:
+    """Pair each photo with its `max_partners` most similar photos at least `min_distance` places away in the order."""
     pairs = set()
     for photo, row in enumerate(similarity):
         row = row.copy()
         row[max(0, photo - min_distance + 1) : photo + min_distance] = -np.inf
-        for other in np.argsort(-row, kind="stable")[:most]:
+        for other in np.argsort(-row, kind="stable")[:max_partners]:
             if np.isfinite(row[other]):
                 pairs.add((min(photo, int(other)), max(photo, int(other))))
     return pairs
@@ -86,12 +86,12 @@ def compute_similarities(descriptors: list[np.ndarray], seed: int, progress: Pro
     """
     rng, count = np.random.default_rng(seed), len(descriptors)
     sample_per_photo = max(1, _VOCABULARY_SAMPLE_DESCRIPTORS // max(count, 1))
-    sample = [found[rng.permutation(len(found))[:sample_per_photo]] for found in descriptors]
+    sample = [own[rng.permutation(len(own))[:sample_per_photo]] for own in descriptors]
     words = _k_means(np.concatenate(sample).astype(np.float32), rng)
     sums = np.zeros((count, *words.shape), np.float32)
-    for photo, found in enumerate(descriptors):
-        if len(found):
-            values = found.astype(np.float32)
+    for photo, own in enumerate(descriptors):
+        if len(own):
+            values = own.astype(np.float32)
             nearest = _nearest_words(values, words)
             np.add.at(sums[photo], nearest, values - words[nearest])
         progress(TaskEvent(f"choosing pairs to match, photo {photo + 1}/{count}", (photo + 1) / count))

@@ -98,12 +98,12 @@ def read_headers(
     """
     photos: list[Photo] = []
     left_out: dict[str, str] = {}
-    # Names that faces and rewritten photos must not get. Some file systems do not tell capital from small letters.
-    taken = {path.relative_to(root).as_posix().casefold() for path in files}
-    first_with: dict[tuple[int, str], str] = {}
+    # Names that faces and rewritten photos must not get. Some file systems ignore letter case.
+    taken_names = {path.relative_to(root).as_posix().casefold() for path in files}
+    first_by_content: dict[tuple[int, str], str] = {}
     sizes = Counter(path.stat().st_size for path in files)
-    found = _map_on_threads(_read_facts_or_reason, files, progress, "reading the headers of photos", len(files))
-    for path, facts in zip(files, found, strict=True):
+    headers = _map_on_threads(_read_facts_or_reason, files, progress, "reading the headers of photos", len(files))
+    for path, facts in zip(files, headers, strict=True):
         source = path.relative_to(root).as_posix()
         shown_name = os.fsencode(source).decode("utf-8", "backslashreplace")
         if shown_name != source:
@@ -114,7 +114,7 @@ def read_headers(
             continue
         size = path.stat().st_size
         if sizes[size] > 1:
-            original = first_with.setdefault((size, hash_file(path)), source)
+            original = first_by_content.setdefault((size, hash_file(path)), source)
             if original != source:
                 left_out[source] = f"{COPY_REASON_PREFIX} {original}"
                 continue
@@ -130,16 +130,16 @@ def read_headers(
                 )
             faces = _make_faces(facts, source)
             names = {face.name.casefold() for face in faces}
-            if taken.isdisjoint(names):
-                taken |= names
+            if taken_names.isdisjoint(names):
+                taken_names |= names
                 photos += faces
             else:
                 left_out[source] = _FACE_NAME_TAKEN_REASON
             continue
         photo = Photo(source, facts, source)
         if not (in_place or photo.is_usable_unchanged):
-            photo = Photo(_rewritten_name(source, taken), facts, source)
-            taken.add(photo.name.casefold())
+            photo = Photo(_rewritten_name(source, taken_names), facts, source)
+            taken_names.add(photo.name.casefold())
         photos.append(photo)
     return sorted(photos, key=lambda photo: photo.name), left_out
 
@@ -161,7 +161,7 @@ def group_by_device(photos: Sequence[Photo], in_place: bool) -> tuple[tuple[Devi
     """
     devices: dict[tuple, int] = {}
     distinct: list[Device] = []
-    device_of = []
+    device_indices = []
     for photo in photos:
         facts = photo.facts
         size = facts.size if photo.face else photo.source_size(in_place)
@@ -170,8 +170,8 @@ def group_by_device(photos: Sequence[Photo], in_place: bool) -> tuple[tuple[Devi
         if key not in devices:
             devices[key] = len(distinct)
             distinct.append(Device(size, facts.focal))
-        device_of.append(devices[key])
-    return tuple(distinct), tuple(device_of)
+        device_indices.append(devices[key])
+    return tuple(distinct), tuple(device_indices)
 
 
 def is_ordered_sequence(photos: Sequence[Photo]) -> bool:
@@ -182,11 +182,11 @@ def is_ordered_sequence(photos: Sequence[Photo]) -> bool:
         return bool(gaps) and gaps[len(gaps) // 2] <= _MAX_BURST_GAP_SECONDS
     if any(photo.facts.device for photo in photos):
         return False
-    found = [re.fullmatch(r"(.*?)(\d+)", PurePosixPath(photo.name).with_suffix("").as_posix()) for photo in photos]
-    if not all(found):
+    matches = [re.fullmatch(r"(.*?)(\d+)", PurePosixPath(photo.name).with_suffix("").as_posix()) for photo in photos]
+    if not all(matches):
         return False
-    stems = {match[1] for match in found if match}
-    numbers = sorted(int(match[2]) for match in found if match)
+    stems = {match[1] for match in matches if match}
+    numbers = sorted(int(match[2]) for match in matches if match)
     return len(stems) == 1 and len(set(numbers)) == len(numbers)
 
 
@@ -200,12 +200,14 @@ def make_images(photos: Sequence[Photo], folder: Path, progress: Progress = igno
     """
     for parent in {(folder / photo.name).parent for photo in photos}:
         parent.mkdir(parents=True, exist_ok=True)
-    whole = [photo for photo in photos if photo.face is None]
-    _map_on_threads(lambda photo: _write_photo(photo, folder / photo.name), whole, progress, _COPYING_TASK, len(photos))
+    ordinary = [photo for photo in photos if photo.face is None]
+    _map_on_threads(
+        lambda photo: _write_photo(photo, folder / photo.name), ordinary, progress, _COPYING_TASK, len(photos)
+    )
     panoramas = {photo.facts.path: (folder / photo.name).parent for photo in photos if photo.face}
     for number, (path, target_folder) in enumerate(panoramas.items(), start=1):
         cut_panorama(path, target_folder)
-        progress(_count_event(_COPYING_TASK, len(whole) + number * len(CUBE_FACES), len(photos)))
+        progress(_count_event(_COPYING_TASK, len(ordinary) + number * len(CUBE_FACES), len(photos)))
 
 
 def find_masks(photos: Sequence[Photo], folder: Path, in_place: bool) -> MaskMatches:
@@ -221,15 +223,15 @@ def find_masks(photos: Sequence[Photo], folder: Path, in_place: bool) -> MaskMat
     """
     sources = {photo.source: photo for photo in photos}  # one of the faces stands for their panorama
     sizes = {source: photo.source_size(in_place) for source, photo in sources.items()}
-    found = mask_files.find_masks(folder, list(sizes.items()), set())
-    choose_mask_orientations([sources[source].with_mask(mask, in_place) for source, mask in found.by_photo.items()])
-    by_name = {photo.name: found.by_photo[photo.source] for photo in photos if photo.source in found.by_photo}
-    return replace(found, by_photo=by_name)
+    matches = mask_files.find_masks(folder, list(sizes.items()), set())
+    choose_mask_orientations([sources[source].with_mask(mask, in_place) for source, mask in matches.by_photo.items()])
+    by_name = {photo.name: matches.by_photo[photo.source] for photo in photos if photo.source in matches.by_photo}
+    return replace(matches, by_photo=by_name)
 
 
 def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) -> dict[str, Path]:
     """Write upright masks into a new folder, under the photo's name + ".png"; return their paths by photo name."""
-    made = {}
+    written = {}
     masked = [photo for photo in photos if photo.name in masks]
     orientations = choose_mask_orientations([photo.with_mask(masks[photo.name], in_place=False) for photo in masked])
     for photo, orientation in zip(masked, orientations, strict=True):
@@ -246,10 +248,10 @@ def make_masks(photos: Sequence[Photo], masks: dict[str, Path], folder: Path) ->
         if photo.face is None and orientation == 1 and mask.suffix.lower() == ".png":
             copy_file(mask, target, keep_metadata=True)
         else:
-            # Black is exactly 0 in what is written: a PNG does not show that a JPEG was lossy.
+            # Black becomes exactly 0, because a PNG does not show that it was a lossy JPEG.
             Image.fromarray(usable.astype(np.uint8) * 255).save(target)
-        made[photo.name] = target
-    return made
+        written[photo.name] = target
+    return written
 
 
 def _read_facts_or_reason(path: Path) -> PhotoFacts | str:
@@ -296,14 +298,14 @@ def _make_faces(facts: PhotoFacts, source: str) -> list[Photo]:
     return [Photo(f"{stem}_{face.name}.jpg", face_facts, source, face) for face in CUBE_FACES]
 
 
-def _rewritten_name(source: str, taken: set[str]) -> str:
-    """Return a free name, with the ending of its new format, for a photo that is rewritten; `taken` is casefolded."""
+def _rewritten_name(source: str, taken_names: set[str]) -> str:
+    """Return a free name, with the ending of its new format, for a rewritten photo; `taken_names` are casefolded."""
     path = PurePosixPath(source)
     ending = ".jpg" if path.suffix.lower() in _SUFFIXES_WRITTEN_AS_JPEG else ".png"
     if path.suffix.lower() in (ending, ".jpeg"):
         return source
     name = path.with_suffix(ending).as_posix()
-    while name.casefold() in taken:
+    while name.casefold() in taken_names:
         source += ending
         name = source
     return name
@@ -339,9 +341,8 @@ def _write_photo(photo: Photo, target: Path) -> None:
         modes = ("L", "RGB") if jpeg else _PNG_MODES
         profile = image.info.get("icc_profile")
         if upright.mode not in modes:
-            profile = (
-                None if upright.mode in ("CMYK", "LAB", "YCbCr") else profile
-            )  # the colour profile belongs to the old mode
+            if upright.mode in ("CMYK", "LAB", "YCbCr"):  # the colour profile describes the old mode
+                profile = None
             upright = upright.convert("RGB")
         metadata = {"icc_profile": profile} if profile else {}
         upright.save(target, "JPEG" if jpeg else "PNG", **(_JPEG_SAVE_OPTIONS if jpeg else {}), **metadata)

@@ -15,7 +15,7 @@ from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.parallel.child_items import child_environment, signal_name
 from hyrfpack.progress import Progress, TaskEvent
 
-MAX_SILENCE_SECONDS = 2.0  # the last message is reported again after this time, so that a display keeps counting
+MAX_SILENCE_SECONDS = 2.0  # the last message is reported again after this time, so that a display keeps updating
 _TERMINATION_TIMEOUT_SECONDS = 3.0  # a process that takes longer to terminate is killed
 _STAGE_DESCRIPTIONS = {
     "features": "finding features",
@@ -126,7 +126,7 @@ def _terminate(process: subprocess.Popen) -> None:
 
 
 def _crash_error(stage: str, code: int, log: Path) -> StageCrashedError:
-    """Return the error that says why a process ended without an answer."""
+    """Return the error that states why a process ended without an answer, from its exit code and its log."""
     doing = _STAGE_DESCRIPTIONS.get(stage, _FINISH_DESCRIPTION)
     text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
     if "disk is full" in text or "No space left" in text or "disk I/O error" in text:
@@ -135,12 +135,12 @@ def _crash_error(stage: str, code: int, log: Path) -> StageCrashedError:
         )
     if "MemoryError" in text or "bad_alloc" in text or (code < 0 and signal_name(code) == "SIGKILL"):
         return StageCrashedError(
-            f"{log.parent}: {doing} took more memory than there is",
+            f"{log.parent}: {doing} needs more memory than is available",
             fix="close other programs and run the same command again, which resumes here",
         )
-    how = f"by {signal_name(code)}" if code < 0 else f"with code {code}"
+    end = f"by {signal_name(code)}" if code < 0 else f"with code {code}"
     last = next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "no message in the log")
     return StageCrashedError(
-        f"{log.parent}: {doing} ended {how} ({last[-160:]})",
+        f"{log.parent}: {doing} ended {end} ({last[-160:]})",
         fix=f"run the same command again, which resumes here; if it fails again, report it and attach {log.name}",
     )

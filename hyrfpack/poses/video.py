@@ -40,8 +40,8 @@ class Video:
         self.size = (self._stream.codec_context.width, self._stream.codec_context.height)
         aspect = float(self._stream.sample_aspect_ratio or 1)
         self.aspect = aspect if 1 / MAX_PIXEL_ASPECT <= aspect <= MAX_PIXEL_ASPECT else 1.0
-        length, unit = self._stream.duration, self._stream.time_base
-        self.seconds = float(length * unit) if length and unit else (container.duration or 0) / 1e6
+        duration, unit = self._stream.duration, self._stream.time_base
+        self.seconds = float(duration * unit) if duration and unit else (container.duration or 0) / 1e6
 
     def frames(self) -> Iterator[tuple[int, float, Any]]:
         """Yield the number, the time in seconds and the av.VideoFrame of each decodable frame, in display order.
@@ -101,7 +101,7 @@ def open_video(path: Path) -> Iterator[Video]:
         ) from error
     try:
         if not container.streams.video:
-            raise HyrfDataError(f"{path}: the file has no video stream", fix="give the path of a video")
+            raise HyrfDataError(f"{path}: the file has no video stream", fix="name a video")
         if container.streams.video[0].codec_context is None:
             raise HyrfDataError(
                 f"{path}: the installed FFmpeg cannot decode this kind of video", fix="save it as H.264 (.mp4)"
@@ -130,11 +130,11 @@ def decode_upright(frame: Any, aspect: float) -> Image:
         picture = Image.fromarray(frame.reformat(format="rgb24", src_colorspace=color_matrix).to_ndarray())
     if abs(aspect - 1) > 0.01:
         picture = picture.resize((round(picture.width * aspect), picture.height), Image.Resampling.LANCZOS)
-    return _displayed(picture, frame)
+    return _apply_display_matrix(picture, frame)
 
 
-def _displayed(picture: Image, frame: Any) -> Image:
-    """Turn and mirror a picture as the display matrix of its frame says, by a multiple of quarter turns.
+def _apply_display_matrix(picture: Image, frame: Any) -> Image:
+    """Rotate a picture by quarter turns and mirror it, as the display matrix of its frame says.
 
     The matrix [[a, b, u], [c, d, v], [x, y, w]] moves a pixel at (p, q) to (a p + c q + x, b p + d q + y).
     """

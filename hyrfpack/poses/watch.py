@@ -1,4 +1,4 @@
-"""Progress of long pycolmap calls, which report nothing: a second thread reads the files that they write."""
+"""Report the progress of long pycolmap calls: a second thread reads the files that they write."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class RowCounter:
 
     def __init__(self, job: Job, table: str) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-I", count_rows_script.__file__, job.database, table],
+            [sys.executable, "-I", count_rows_script.__file__, job.database_path, table],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -107,12 +107,12 @@ def report_new_rows(job: Job, table: str, report_count: Callable[[int], None]) -
 
 
 @contextmanager
-def report_global_mapping_phase(log: Path, doing: str, report_progress: Progress) -> Iterator[None]:
+def report_global_mapping_phase(log: Path, task: str, report_progress: Progress) -> Iterator[None]:
     """While the block runs, report the phase of the global mapper, read from its log.
 
     Args:
-        log: file of the library's messages.
-        doing: description that comes before the phase.
+        log: file of pycolmap's messages.
+        task: description that comes before the phase.
         report_progress: called with `TaskEvent`s, whose share is that of the mapping.
     """
     before = log.stat().st_size if log.exists() else 0
@@ -123,7 +123,7 @@ def report_global_mapping_phase(log: Path, doing: str, report_progress: Progress
             text = file.read().decode("utf-8", "replace")
         phase, share = parse_global_mapping_phase(text)
         if phase:
-            report_progress(TaskEvent(f"{doing}: {phase}", share))
+            report_progress(TaskEvent(f"{task}: {phase}", share))
 
     with poll_in_background(poll):
         yield

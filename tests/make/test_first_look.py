@@ -112,9 +112,9 @@ def test_an_interrupted_first_look_leaves_nothing_and_the_same_call_resumes(make
 def test_frames_of_a_video_are_reduced(poses, tmp_path, monkeypatch):
     taken = []
 
-    def choose_frames(video, folder, *, most, progress):
+    def choose_frames(video, folder, *, max_frames, progress):
         folder.mkdir(parents=True)
-        for number in range(most):
+        for number in range(max_frames):
             Image.new("RGB", (32, 24)).save(folder / f"frame_{number:06}.jpg")
         taken.append(video)
 

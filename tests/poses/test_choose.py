@@ -9,7 +9,7 @@ from hyrfpack.poses.choose import (
     choose_candidate,
     confirm_each_other,
     confirmed_photos,
-    describe_doubt,
+    describe_unconfirmed_poses,
 )
 
 
@@ -40,16 +40,20 @@ def test_disagreement_of_the_mappers_is_noted_and_agreement_is_not():
     poses = circle_poses()
     names = sorted(poses)
     folded = {**poses, **{name: poses[onto] for name, onto in zip(names[16:], names[:8], strict=True)}}
-    assert describe_doubt(poses, make_candidate("global", transform_poses(poses), 1000)) == ""
-    said = describe_doubt(poses, make_candidate("global", transform_poses(folded), 800))
+    assert describe_unconfirmed_poses(poses, make_candidate("global", transform_poses(poses), 1000)) == ""
+    said = describe_unconfirmed_poses(poses, make_candidate("global", transform_poses(folded), 800))
     assert said.startswith("16 of 24 poses are confirmed by both mappers; the global mapper gives 8 photos other poses")
     nearly = circle_poses(6)
     turned = {**nearly, "x": nearly[min(nearly)]}
     nearly["x"] = nearly[max(nearly)]
-    assert "gives 1 photo other poses" in describe_doubt(nearly, make_candidate("global", transform_poses(turned), 800))
+    assert "gives 1 photo other poses" in describe_unconfirmed_poses(
+        nearly, make_candidate("global", transform_poses(turned), 800)
+    )
     lacking = {name: poses[name] for name in names[:10]}
-    assert "has no pose for 14" in describe_doubt(poses, make_candidate("incremental", transform_poses(lacking), 400))
-    assert "the poses of these 24 photos are not confirmed" in describe_doubt(poses, None)
+    assert "has no pose for 14" in describe_unconfirmed_poses(
+        poses, make_candidate("incremental", transform_poses(lacking), 400)
+    )
+    assert "the poses of these 24 photos are not confirmed" in describe_unconfirmed_poses(poses, None)
 
 
 def test_the_largest_agreeing_piece_of_the_other_mapper_confirms_poses():
@@ -59,7 +63,7 @@ def test_the_largest_agreeing_piece_of_the_other_mapper_confirms_poses():
     second = transform_poses({name: poses[name] for name in names[9:]}, scale=0.2, seed=4)
     other = make_candidate("incremental", first, 500, other_pieces=(second,))
     assert confirmed_photos(poses, other) == set(names[9:])
-    assert describe_doubt(poses, other).startswith("15 of 24 poses are confirmed")
+    assert describe_unconfirmed_poses(poses, other).startswith("15 of 24 poses are confirmed")
 
 
 def test_two_results_that_agree_on_95_percent_of_the_photos_confirm_each_other():

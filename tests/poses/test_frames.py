@@ -125,7 +125,7 @@ def test_frames_are_spread_by_motion_and_not_by_time(wall, tmp_path):
     """The camera moves twice as fast in the second half; both parts of the path give the same number of frames."""
     places = np.concatenate((np.arange(0, 300, 2.0), np.arange(300, 900, 6.0)))
     video = write_video(tmp_path / "clip.mp4", [crop_wall(wall, x) for x in places])
-    report = choose_frames(video, tmp_path / "frames", most=40)
+    report = choose_frames(video, tmp_path / "frames", max_frames=40)
     numbers = frame_numbers(tmp_path / "frames")
     assert 30 <= len(numbers) <= 40
     steps = np.diff(places[numbers]) / FRAME_WIDTH
@@ -155,7 +155,7 @@ def test_a_repeated_call_does_nothing_and_an_interrupted_call_resumes(wall, tmp_
     assert all(path.stat().st_mtime_ns == time for path, time in before.items() if path != removed)
     assert not any(event.task.startswith("measuring") for event in events) and events[-1].share == 1.0
     (folder / "mine.jpg").write_bytes(b"kept")
-    fewer = choose_frames(video, folder, most=10)
+    fewer = choose_frames(video, folder, max_frames=10)
     assert fewer.taken <= 10 and len(list(folder.glob("frame_*.jpg"))) == fewer.taken
     assert (folder / "mine.jpg").read_bytes() == b"kept"
 
@@ -248,7 +248,7 @@ def test_a_video_that_changes_its_size_is_not_called_damaged(wall, tmp_path, mon
     monkeypatch.setattr(Video, "frames", resized_frames)
     video = write_video(tmp_path / "clip.mkv", [crop_wall(wall, 4.0 * number) for number in range(120)])
     assert choose_frames(video, tmp_path / "frames").notes == (
-        "the picture changes its size after 2 s; what follows was not used",
+        "the picture changes its size after 2 s; the frames after that are not used",
     )
 
 
@@ -396,6 +396,6 @@ def test_a_360_degree_video_is_refused_by_its_own_name(tmp_path):
     frames = [np.roll(panorama, 4 * number, axis=1) for number in range(20)]
     video = write_video(tmp_path / "round.mp4", frames)
     sentence = refused("poses", video, "-o", tmp_path / "scene")
-    assert "round.mp4: this video shows all around (360 degrees)" in sentence
+    assert "round.mp4: this is a 360-degree video" in sentence
     assert sentence.endswith("save frames of the video as pictures in a folder, and name that folder")
     assert not (tmp_path / "scene").exists()

@@ -151,7 +151,7 @@ def test_poses_in_place_are_completed_after_the_worker_was_killed(photos_and_pos
         if "matching pair" in event.task:
             stage_processes[-1].kill()
 
-    with pytest.raises(hyrfpack.HyrfError, match="more memory than there is.*resumes here"):
+    with pytest.raises(hyrfpack.HyrfError, match="more memory than is available.*resumes here"):
         hyrfpack.estimate_poses(tmp_path, tmp_path, overwrite=True, context=RunContext(progress=kill))
     result = succeeded("poses", tmp_path, "-o", tmp_path, "--overwrite", "--json")
     assert "resuming an interrupted estimation" in result.stderr
@@ -172,7 +172,9 @@ def test_a_signal_without_a_name_is_reported_by_its_number(tmp_path):
     """Real-time signals have no names in Python, but for the first and the last."""
     error = process._crash_error("matches", -40, tmp_path / "matches.log")
     assert "matching photos ended by signal 40 (no message in the log)" in str(error)
-    assert "more memory than there is" in process._crash_error("matches", -signal.SIGKILL, tmp_path / "no.log").problem
+    assert (
+        "more memory than is available" in process._crash_error("matches", -signal.SIGKILL, tmp_path / "no.log").problem
+    )
     assert process._crash_error("matches", -signal.SIGABRT, tmp_path / "matches.log").problem.count("by SIGABRT") == 1
 
 

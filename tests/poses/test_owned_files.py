@@ -52,8 +52,8 @@ def estimate_with_fake_stages(source: Path, scene: Path, at_end=lambda: None, **
         return {
             "features": {"keypoints": dict.fromkeys(names, 99), "sharpness": dict.fromkeys(names, 1), "unreadable": {}},
             "matches": {"matched": names, "pairs": 6, "turned": 0},
-            "finish": {"registered": names, "sure": names, "apart": [], "mapper": "global", "why": "", "doubt": "",
-                       "angle": 30},
+            "finish": {"registered": names, "sure": names, "in_other_pieces": [], "mapper": "global", "why": "",
+                       "warning": "", "angle": 30},
         }.get(stage, {"models": []})  # fmt: skip
 
     with pytest.MonkeyPatch.context() as patch:
@@ -220,7 +220,7 @@ def test_files_beside_the_model_are_never_removed(name, has_list, tmp_path):
     (scene / "sparse" / ".DS_Store").write_bytes(b"of the file manager")
     (scene / name).parent.mkdir(exist_ok=True)
     (scene / name).write_bytes(b"mine")
-    with pytest.raises(hyrfpack.HyrfError, match=f"{name}: this file would be removed, and no estimation"):
+    with pytest.raises(hyrfpack.HyrfError, match=f"{name}: this file would be removed, but no estimation"):
         estimate_with_fake_stages(photos, scene, overwrite=True)
     assert (scene / name).read_bytes() == b"mine"
     (scene / name).unlink()

@@ -377,7 +377,7 @@ def test_masked_parts_have_no_features_and_photos_without_masks_keep_theirs(tmp_
         tmp_path / "images", tmp_path / "work", tuple(names), (Device(PHOTO_SIZE),), (0, 0, 0), masks, "exhaustive", 0
     )
     find_features(job, ignore_progress)
-    with pycolmap.Database.open(job.database) as database:
+    with pycolmap.Database.open(job.database_path) as database:
         masked, free = (np.asarray(database.read_keypoints(number))[:, 0] for number in (1, 2))
     assert masked.min() >= PHOTO_SIZE[0] // 2 - 1 > free.min()
     assert len(masked) > 50 and len(free) > 50

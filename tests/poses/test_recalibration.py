@@ -9,7 +9,7 @@ import pytest
 from made_up_photos import FOCAL_PIXELS, PHOTO_SIZE
 
 import hyrfpack  # must come before pycolmap  # noqa: F401
-from hyrfpack.poses.database import make_database, open_database, read_cameras, recalibrate, verified_pairs
+from hyrfpack.poses.database import create_database, open_database, read_cameras, recalibrate, verified_pairs
 from hyrfpack.poses.job import Device, Job
 from hyrfpack.progress import ignore_progress
 
@@ -21,7 +21,7 @@ def make_job(folder: Path) -> Job:
     folder.mkdir()
     names = ("a.png", "b.png", "c.png")
     job = Job(folder, folder, names, (Device(PHOTO_SIZE, FOCAL_PIXELS),), (0, 0, 0), {}, "exhaustive", 0)
-    make_database(job)
+    create_database(job)
     rng = np.random.default_rng(0)
     points = rng.uniform((-1, -1, 4), (1, 1, 8), (60, 3))
     centre, matches = np.array(PHOTO_SIZE) / 2, np.column_stack([np.arange(60)] * 2).astype(np.uint32)
@@ -33,7 +33,7 @@ def make_job(folder: Path) -> Job:
         database.write_matches(1, 2, matches)
         for first in (1, 2):  # so few that no geometry has enough inliers by chance
             database.write_matches(first, 3, matches[:16])
-    pycolmap.geometric_verification(job.database)
+    pycolmap.geometric_verification(job.database_path)
     assert pairs_in(job) == [(1, 2)]
     return job
 

@@ -31,7 +31,7 @@ MAPPER_LOG = [
 
 def job_with_pairs(folder: Path, count: int) -> Job:
     job = Job(folder, folder, ("a.png",), (), (0,), {}, "exhaustive", 0)
-    connection = sqlite3.connect(job.database)
+    connection = sqlite3.connect(job.database_path)
     connection.execute("PRAGMA journal_mode=WAL")
     connection.execute("CREATE TABLE two_view_geometries (pair_id INTEGER)")
     connection.executemany("INSERT INTO two_view_geometries VALUES (?)", [(number,) for number in range(count)])
@@ -59,7 +59,7 @@ def test_the_phase_of_the_global_mapper_follows_its_log_and_never_goes_back():
 
 def test_rows_are_counted_while_another_connection_writes(tmp_path):
     job = job_with_pairs(tmp_path, 5)
-    writer = sqlite3.connect(job.database)
+    writer = sqlite3.connect(job.database_path)
     writer.execute("INSERT INTO two_view_geometries VALUES (9)")  # the transaction is not committed
     assert count_rows(job, "two_view_geometries") == 5
     writer.commit()
@@ -75,12 +75,12 @@ def test_counting_keeps_the_locks_that_the_library_holds_on_the_database(tmp_pat
 
     job, place = job_with_pairs(tmp_path, 5), 1 << 20
     take_lock = f"import fcntl, sys; fcntl.lockf(open(sys.argv[1], 'r+b'), {fcntl.LOCK_EX | fcntl.LOCK_NB}, 1, {place})"
-    with job.database.open("r+b") as file:
+    with job.database_path.open("r+b") as file:
         fcntl.lockf(file, fcntl.LOCK_EX, 1, place)
         counts: list[int] = []
         with report_new_rows(job, "two_view_geometries", counts.append):
             assert count_rows(job, "two_view_geometries") == 5
-        other = subprocess.run([sys.executable, "-c", take_lock, job.database], capture_output=True, check=False)
+        other = subprocess.run([sys.executable, "-c", take_lock, job.database_path], capture_output=True, check=False)
 
     assert other.returncode != 0 and b"BlockingIOError" in other.stderr
 
@@ -100,7 +100,7 @@ def test_rows_that_a_long_call_writes_are_reported_while_it_runs(tmp_path, monke
             seen.set()
 
     with report_new_rows(job, "two_view_geometries", tell):
-        writer = sqlite3.connect(job.database)
+        writer = sqlite3.connect(job.database_path)
         writer.executemany("INSERT INTO two_view_geometries VALUES (?)", [(6,), (7,)])
         writer.commit()
         writer.close()
