@@ -12,7 +12,7 @@ from hyrfpack.data.archive import archive_paths_in_errors, is_archive, unpack
 from hyrfpack.data.cache import PictureCache
 from hyrfpack.data.folder import explain_missing_path, list_photos, list_raw_photos
 from hyrfpack.data.layouts import LAYOUTS
-from hyrfpack.data.search import find_set
+from hyrfpack.data.search import find_only_subfolder
 from hyrfpack.data.unusable import no_photos_error, raise_if_single_photo
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError, suggest_command
 from hyrfpack.outputs import VIDEO_SUFFIXES
@@ -43,7 +43,7 @@ def load_scene(
             Masks in `masks/` beside the photos are applied (0 = ignored pixel).
         test_every: hold out every n-th view of the sorted names, beginning with the first; 0 holds out none.
             If the dataset has its own split, that split is used instead.
-        images: take the photos from this folder ("images_2"); intrinsics are scaled to the size of its files.
+        images: the folder to read the photos from ("images_2"); intrinsics are scaled to the size of its files.
         layout: one of LAYOUTS, for instance "colmap" or "nerfstudio". None takes the first layout that is found;
             `Scene.notes` names it if there are several.
         model: name of the folder of a COLMAP model ("1" for `sparse/1`). None takes the model with the most photos;
@@ -92,14 +92,14 @@ def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], hel
         held_out: as in `load_scene`.
     """
     layout, images, model = reading["layout"], reading["images"], reading["model"]
-    folder, found = _find_set(top, layout, notes)
-    if not found or layout not in (None, *found):
-        raise _no_poses(given, folder, layout, other=bool(found))
-    chosen = layout or found[0]
+    folder, layouts = _find_posed_folder(top, layout, notes)
+    if not layouts or layout not in (None, *layouts):
+        raise _no_poses_error(given, folder, layout, has_other_layouts=bool(layouts))
+    chosen = layout or layouts[0]
     reader, options = LAYOUTS[chosen], {"images": images, "model": model}
     if images is not None and "images" not in reader.options:
         raise HyrfDataError(
-            f"{folder}: the {chosen} poses name their own pictures, so that the folder '{images}' cannot be chosen",
+            f"{folder}: {chosen} poses state the paths of their photos, so that the folder '{images}' cannot be chosen",
             fix="leave out `images`",
         )
     if model is not None and "model" not in reader.options:
@@ -110,8 +110,8 @@ def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], hel
     wanted = {name: options[name] for name in reader.options}
     every = reading["test_every"] if held_out is None else 0
     scene = reader.read(folder, test_every=every, max_size=reading["max_size"], **wanted)
-    if len(found) > 1:
-        notes.append(f"there are poses in several layouts ({' and '.join(found)}); {chosen} is used")
+    if len(layouts) > 1:
+        notes.append(f"there are poses in several layouts ({' and '.join(layouts)}); {chosen} is used")
     scene.notes[:0] = notes
     files = (*scene.files, str(given)) if is_archive(given) else scene.files
     reading = {**reading, "layout": chosen}
@@ -137,13 +137,13 @@ def _open_folder(given: Path, notes: list[str]) -> Path:
             raise HyrfNoPosesError(f"{given}: a video has no poses", fix=pose_commands(given))
         raise_if_single_photo(given)
         raise HyrfDataError(
-            f"{given}: a file, not a folder",
+            f"{given}: this is a file, not a folder",
             fix="give the folder that holds photos and poses, or its .zip",
         )
     return given
 
 
-def _find_set(folder: Path, layout: str | None, notes: list[str]) -> tuple[Path, list[str]]:
+def _find_posed_folder(folder: Path, layout: str | None, notes: list[str]) -> tuple[Path, list[str]]:
     """Find the folder with poses, which is `folder` or the only folder below it that has poses.
 
     If a layout is given, only poses of that layout count. A note is added if the poses lie in a folder below `folder`.
@@ -152,11 +152,11 @@ def _find_set(folder: Path, layout: str | None, notes: list[str]) -> tuple[Path,
         The folder, and the names of all layouts whose poses it holds.
     """
 
-    def holds(folder: Path) -> bool:
-        found = _layouts_in(folder)
-        return bool(found) if layout is None else layout in found
+    def has_poses(folder: Path) -> bool:
+        layouts = _layouts_in(folder)
+        return bool(layouts) if layout is None else layout in layouts
 
-    inside = None if holds(folder) else find_set(folder, holds)
+    inside = None if has_poses(folder) else find_only_subfolder(folder, has_poses)
     if inside is not None:
         notes.append(f"the photos and poses in {inside.relative_to(folder)} are used")
     return inside or folder, _layouts_in(inside or folder)
@@ -167,18 +167,18 @@ def _layouts_in(folder: Path) -> list[str]:
     return [name for name, reader in LAYOUTS.items() if reader.is_present(folder)]
 
 
-def _no_poses(given: Path, folder: Path, layout: str | None, other: bool) -> HyrfDataError:
+def _no_poses_error(given: Path, folder: Path, layout: str | None, has_other_layouts: bool) -> HyrfDataError:
     """Return the exception for a folder without poses, or without poses of the requested layout."""
-    photos = [] if other or layout else list_photos(folder)
+    photos = [] if has_other_layouts or layout else list_photos(folder)
     if photos:
         return HyrfNoPosesError(f"{given}: no poses found for the {len(photos)} photos", fix=pose_commands(given))
-    if not (other or layout) and list_raw_photos(folder):
+    if not (has_other_layouts or layout) and list_raw_photos(folder):
         return no_photos_error(given, folder)
     files = [LAYOUTS[layout].files] if layout else [reader.files for reader in LAYOUTS.values()]
     kind = f"{layout} " if layout else ""
     return HyrfDataError(
         f"{given}: no {kind}poses found (looked for {', '.join(files)})",
-        fix="give the folder that holds them",
+        fix="name the folder that holds the poses",
     )
 
 

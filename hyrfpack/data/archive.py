@@ -30,7 +30,7 @@ _UNPACKED_SLACK_BYTES = 1 << 26
 _COPY_CHUNK_BYTES = 1 << 20
 _PARTIAL_FOLDER_PREFIX = ".partial-"
 _MAX_PARTIAL_FOLDER_AGE_SECONDS = 24 * 3600
-_archive_by_folder: dict[Path, Path] = {}  # archives that this process has unpacked or found unpacked
+_archive_by_folder: dict[Path, Path] = {}  # archives whose unpacked files this process has used
 _ENCRYPTED_FLAG = 0x1
 _UTF8_NAME_FLAG = 0x800
 _DISK_FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT)
@@ -54,7 +54,7 @@ def unpack(archive: Path) -> Path:
 
     Raises:
         HyrfDataError: the archive is damaged, encrypted or hostile, or the disk has no room for its files.
-        HyrfError: there is no folder to unpack it into.
+        HyrfError: there is no cache folder that can be written.
     """
     try:
         with zipfile.ZipFile(archive) as content:
@@ -69,17 +69,17 @@ def unpack(archive: Path) -> Path:
     except OSError as error:
         raise HyrfDataError(
             f"{archive}: its files cannot be unpacked ({error.strerror or error})",
-            fix=f"{'make room, or ' * (error.errno in _DISK_FULL_ERRORS)}unpack it yourself and give the folder",
+            fix=f"{'make room, or ' * (error.errno in _DISK_FULL_ERRORS)}unpack it yourself and name the folder",
         ) from error
     except (NotImplementedError, RuntimeError) as error:
         raise HyrfDataError(
-            f"{archive}: the archive is packed in a way that cannot be read here ({str(error)[:120]})",
-            fix="unpack it yourself and give the folder",
+            f"{archive}: the archive uses a feature of ZIP that is not supported ({str(error)[:120]})",
+            fix="unpack it yourself and name the folder",
         ) from error
     except Exception as error:  # zipfile and its decompressors raise exceptions of many types
         raise HyrfDataError(
             f"{archive}: the archive is damaged ({short_reason(error)})",
-            fix="copy or make it again",
+            fix="copy the archive again, or create it again",
         ) from error
 
 
@@ -130,29 +130,29 @@ def _checked_entries(archive: Path, content: zipfile.ZipFile) -> dict[str, zipfi
             continue
         if name.startswith("/") or ".." in parts or ":" in parts[0] or "\0" in name:
             raise HyrfDataError(
-                f"{archive}: holds a file '{name[:80]}' that would be written outside its folder, so nothing of it is "
-                "unpacked",
-                fix="make it again",
+                f"{archive}: the archive holds a file '{name[:80]}' that would be written outside its folder, so "
+                "nothing is unpacked",
+                fix="create the archive again",
             )
         if stat.S_ISLNK(info.external_attr >> 16):
             raise HyrfDataError(
-                f"{archive}: holds a link, '{name[:80]}'",
+                f"{archive}: the archive holds a link, '{name[:80]}'",
                 fix="create the archive again with the files themselves",
             )
         if info.flag_bits & _ENCRYPTED_FLAG:
-            raise HyrfDataError(f"{archive}: the archive is encrypted", fix="unpack it yourself and give the folder")
+            raise HyrfDataError(f"{archive}: the archive is encrypted", fix="unpack it yourself and name the folder")
         path = "/".join(parts)
         if path in entries:
-            raise HyrfDataError(f"{archive}: holds '{path[:80]}' twice", fix="make it again")
+            raise HyrfDataError(f"{archive}: the archive holds '{path[:80]}' twice", fix="create the archive again")
         entries[path] = info
     for folder in {parent.as_posix() for path in entries for parent in PurePosixPath(path).parents}:
         if folder in entries:
             raise HyrfDataError(
                 f"{archive}: its files cannot be unpacked, because '{folder[:80]}' is both a file and a folder in it",
-                fix="make it again",
+                fix="create the archive again",
             )
     if not entries:
-        raise HyrfDataError(f"{archive}: the archive holds no files", fix="give the archive of a set of photos")
+        raise HyrfDataError(f"{archive}: the archive holds no files", fix="name the archive of a set of photos")
     total = sum(info.file_size for info in entries.values())
     if len(entries) > _MAX_FILES or total > _MAX_UNPACKED_RATIO * os.path.getsize(archive) + _UNPACKED_SLACK_BYTES:
         raise HyrfDataError(
@@ -188,7 +188,7 @@ def _write_entries(archive: Path, content: zipfile.ZipFile, entries: dict[str, z
         raise HyrfDataError(
             f"{archive}: its {total / 1e9:.1f} GB of files do not fit on the disk of {folder.parent}, which has "
             f"{free / 1e9:.1f} GB left",
-            fix="make room, or unpack it elsewhere and give the folder",
+            fix="make room, or unpack it elsewhere and name the folder",
         )
     partial = Path(tempfile.mkdtemp(prefix=_PARTIAL_FOLDER_PREFIX, dir=folder.parent))
     try:

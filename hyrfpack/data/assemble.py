@@ -34,8 +34,8 @@ _MAX_PHOTOS_CHECKED_FOR_ALPHA = 4
 
 
 @dataclass(frozen=True)
-class Photo:
-    """A photo as its dataset describes it.
+class PosedPhoto:
+    """A photo with a pose, as its dataset describes it.
 
     Attributes:
         name: path below the picture folder.
@@ -63,10 +63,10 @@ class Photo:
     visible_points: np.ndarray | None = None
 
 
-def make_scene(
+def assemble_scene(
     path: Path,
     layout: str,
-    photos: list[Photo],
+    photos: list[PosedPhoto],
     *,
     test_every: int,
     max_size: int,
@@ -123,20 +123,20 @@ def make_scene(
     raw_photos = _list_raw_photos_beside(photos)
     notes += [*_shared_pose_notes(views), *_loading_notes(photos, max_size, mask_notes), *raw_photos_notes(raw_photos)]
     points, point_colors, tracks = _drop_nonfinite_points(points, point_colors, photos, notes)
-    read = [file for photo in photos for file in (photo.path, photo.mask) if file is not None]
-    files = tuple(str(file) for file in (*tables, *read))
+    pictures = [file for photo in photos for file in (photo.path, photo.mask) if file is not None]
+    files = tuple(str(file) for file in (*tables, *pictures))
     has_alpha = _has_transparency(photos, max_size)
     return Scene(str(path), layout, train, test, points, point_colors, has_alpha, notes, files, max_size, tracks)
 
 
-def _assign_masks(photos: list[Photo], folder: Path) -> tuple[list[Photo], list[str]]:
+def _assign_masks(photos: list[PosedPhoto], folder: Path) -> tuple[list[PosedPhoto], list[str]]:
     """Assign masks from a folder to the photos whose poses name none; also return notes about unmatched masks."""
     used = {photo.mask for photo in photos if photo.mask is not None}
     found = find_masks(folder, [(photo.name, photo.header.size) for photo in photos if photo.mask is None], used)
     return [replace(photo, mask=found.by_photo.get(photo.name, photo.mask)) for photo in photos], found.notes
 
 
-def _orient_masks(photos: list[Photo]) -> list[Photo]:
+def _orient_masks(photos: list[PosedPhoto]) -> list[PosedPhoto]:
     """Check the shapes of the masks, and choose by which orientation each is turned."""
     masked = {
         # Panoramas are cut into faces as they are stored.
@@ -148,19 +148,19 @@ def _orient_masks(photos: list[Photo]) -> list[Photo]:
     return [replace(photo, mask_orientation=orientations.get(photo.name, 1)) for photo in photos]
 
 
-def _is_panorama(photo: Photo) -> bool:
+def _is_panorama(photo: PosedPhoto) -> bool:
     """Return whether a photo is a whole panorama, which is not yet cut into faces."""
     return photo.lens.model == "equirectangular"
 
 
-def _cut_panoramas(photos: list[Photo], held_out: Set[str]) -> tuple[list[Photo], set[str]]:
+def _cut_panoramas(photos: list[PosedPhoto], held_out: Set[str]) -> tuple[list[PosedPhoto], set[str]]:
     """Replace panoramas by the photos of their faces, and return these photos and the names of held-out ones."""
-    parts = {photo.name: _panorama_faces(photo) if _is_panorama(photo) else [photo] for photo in photos}
-    names = {part.name for name in held_out for part in parts.get(name, ())}
-    return [part for cut in parts.values() for part in cut], names
+    faces_by_name = {photo.name: _panorama_faces(photo) if _is_panorama(photo) else [photo] for photo in photos}
+    names = {face.name for name in held_out for face in faces_by_name.get(name, ())}
+    return [face for faces in faces_by_name.values() for face in faces], names
 
 
-def _check_face_names(photos: list[Photo], path: Path) -> None:
+def _check_face_names(photos: list[PosedPhoto], path: Path) -> None:
     """Raise HyrfDataError if a face of a panorama has the name of another photo."""
     panoramas = {photo.name: photo.path for photo in photos if photo.face is not None}
     for photo in photos:
@@ -172,7 +172,7 @@ def _check_face_names(photos: list[Photo], path: Path) -> None:
             )
 
 
-def _list_raw_photos_beside(photos: list[Photo]) -> list[Path]:
+def _list_raw_photos_beside(photos: list[PosedPhoto]) -> list[Path]:
     """List the raw files in the folders of the photos, as far as these folders may be listed."""
     found: list[Path] = []
     for folder in sorted({photo.path.parent for photo in photos}):
@@ -181,7 +181,7 @@ def _list_raw_photos_beside(photos: list[Photo]) -> list[Path]:
     return found
 
 
-def _loading_notes(photos: list[Photo], max_size: int, mask_notes: list[str]) -> list[str]:
+def _loading_notes(photos: list[PosedPhoto], max_size: int, mask_notes: list[str]) -> list[str]:
     """Return notes about how photos are changed when they are loaded."""
     notes = []
     of_photos = f"of {len(photos):,} photos"
@@ -204,9 +204,9 @@ def _loading_notes(photos: list[Photo], max_size: int, mask_notes: list[str]) ->
 
 
 def missing_photos_notes(
-    path: Path, photos: list[Photo], missing: list[str], where: str, ambiguous: Sequence[str] = ()
+    path: Path, photos: list[PosedPhoto], missing: list[str], where: str, ambiguous: Sequence[str] = ()
 ) -> list[str]:
-    """Return a list with a note about listed photos that are not on disk; the list is empty if none is missing.
+    """Return a list of one note about listed photos that are not on disk; an empty list if none is missing.
 
     Args:
         path: the scene folder.
@@ -230,7 +230,7 @@ def missing_photos_notes(
             f"{min(missing)}; {_describe_folder(path, min(missing))})",
             fix="put them at the paths that the poses name, as JPEG or PNG",
         )
-    # Those that fit several files have a note of their own.
+    # Photos that fit several files are listed by another note.
     absent = [file for file in missing if not any(f"/{file}".endswith(f"/{name}") for name in ambiguous)]
     if not absent:
         return []
@@ -258,7 +258,7 @@ def _describe_folder(path: Path, name: str) -> str:
 
 
 def _shared_pose_notes(views: list[View]) -> list[str]:
-    """Return a list with a note if photos have exactly the same pose, which is usually a mistake."""
+    """Return a list of one note if photos have exactly the same pose, a common mistake; an empty list otherwise."""
     names_by_pose: dict[bytes, list[str]] = {}
     for view in views:
         names_by_pose.setdefault(view.camera.camera_from_world.tobytes(), []).append(view.name)
@@ -271,7 +271,7 @@ def _shared_pose_notes(views: list[View]) -> list[str]:
     ]
 
 
-def _apply_orientations(photos: list[Photo], notes: list[str]) -> list[Photo]:
+def _apply_orientations(photos: list[PosedPhoto], notes: list[str]) -> list[PosedPhoto]:
     """Apply EXIF orientations to the photos whose cameras were calibrated on upright pictures.
 
     The sizes show which photos these are: the stored picture does not fit the camera, but the picture after a quarter
@@ -279,10 +279,10 @@ def _apply_orientations(photos: list[Photo], notes: list[str]) -> list[Photo]:
     decide.
     """
 
-    def fits(photo: Photo) -> bool:
+    def fits(photo: PosedPhoto) -> bool:
         return has_same_aspect(*photo.header.size, photo.lens.width, photo.lens.height)
 
-    def fits_turned(photo: Photo) -> bool:
+    def fits_turned(photo: PosedPhoto) -> bool:
         return has_same_aspect(*photo.header.size[::-1], photo.lens.width, photo.lens.height)
 
     if all(fits(photo) for photo in photos):
@@ -306,7 +306,7 @@ def _apply_orientations(photos: list[Photo], notes: list[str]) -> list[Photo]:
     ]
 
 
-def _panorama_faces(photo: Photo) -> list[Photo]:
+def _panorama_faces(photo: PosedPhoto) -> list[PosedPhoto]:
     """Split a panorama into photos of its six faces: "street.jpg" becomes "street_front.jpg" and so on."""
     size = face_size(photo.header.width)
     name = photo.name.removesuffix(photo.path.suffix)
@@ -329,7 +329,7 @@ def _panorama_faces(photo: Photo) -> list[Photo]:
     return faces
 
 
-def _make_view(photo: Photo, max_size: int) -> View:
+def _make_view(photo: PosedPhoto, max_size: int) -> View:
     """Check a photo's lens, size and pose, and make a view of it."""
     lens, header = photo.lens, photo.header
     if not _is_plausible(lens):
@@ -380,24 +380,24 @@ def _orthonormal_pose(pose: np.ndarray, path: Path) -> np.ndarray:
     return rigid
 
 
-def _has_transparency(photos: list[Photo], max_size: int) -> bool:
+def _has_transparency(photos: list[PosedPhoto], max_size: int) -> bool:
     """Return whether any of a few photos with an alpha channel has a transparent pixel.
 
     The pixels decide, because many alpha channels are opaque throughout.
     """
 
-    def alpha(photo: Photo) -> np.ndarray:
+    def read_alpha(photo: PosedPhoto) -> np.ndarray:
         size = fit_size(*photo.header.size, max_size)
-        pixels = read_pixels(photo.path, None if size == photo.header.size else size, photo.orientation)[1]
-        assert pixels is not None  # only photos with an alpha channel are read
-        return pixels
+        _, alpha = read_pixels(photo.path, None if size == photo.header.size else size, photo.orientation)
+        assert alpha is not None  # only photos with an alpha channel are read
+        return alpha
 
     candidates = [photo for photo in photos if photo.header.has_alpha]
-    return any(alpha(photo).min() < 255 for photo in evenly_spaced(candidates, _MAX_PHOTOS_CHECKED_FOR_ALPHA))
+    return any(read_alpha(photo).min() < 255 for photo in evenly_spaced(candidates, _MAX_PHOTOS_CHECKED_FOR_ALPHA))
 
 
 def _drop_nonfinite_points(
-    points: np.ndarray | None, colors: np.ndarray | None, photos: Sequence[Photo], notes: list[str]
+    points: np.ndarray | None, colors: np.ndarray | None, photos: Sequence[PosedPhoto], notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Return the finite points, their colours, and for each photo the rows of the points that it shows."""
     if points is None or colors is None:

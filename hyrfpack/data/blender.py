@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
 
-from hyrfpack.data.assemble import Photo, make_scene, missing_photos_notes
+from hyrfpack.data.assemble import PosedPhoto, assemble_scene, missing_photos_notes
 from hyrfpack.data.names import PictureIndex
 from hyrfpack.data.pictures import read_header
 from hyrfpack.data.transforms import finite_number, focal_from_angle, pose_from_opengl, read_transforms
@@ -35,7 +35,7 @@ def read_blender(path: Path, *, test_every: int, max_size: int) -> Scene:
         if held_out == "val":
             notes.append("there is no transforms_test.json; the photos of transforms_val.json are held out")
     tables = [path / f"transforms_{split}.json" for split in ("train", held_out) if split is not None]
-    return make_scene(
+    return assemble_scene(
         path,
         "blender",
         photos,
@@ -48,14 +48,14 @@ def read_blender(path: Path, *, test_every: int, max_size: int) -> Scene:
     )
 
 
-def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:
+def _read_split(path: Path, split: str, notes: list[str]) -> list[PosedPhoto]:
     """Read the photos of one transforms file."""
     file = path / f"transforms_{split}.json"
     content = read_transforms(file)
     angle = finite_number(content, "camera_angle_x", file)
     if angle is None:
         raise HyrfDataError(f"{file}: has no 'camera_angle_x', so the focal length is unknown", fix="add it")
-    photos: list[Photo] = []
+    photos: list[PosedPhoto] = []
     missing: list[str] = []
     index = PictureIndex(path)
     matches = index.match(frame["file_path"] for frame in content["frames"])
@@ -68,7 +68,7 @@ def _read_split(path: Path, split: str, notes: list[str]) -> list[Photo]:
         focal = focal_from_angle(angle, header.width, file, "camera_angle_x")
         lens = Lens(header.width, header.height, focal, focal, header.width / 2, header.height / 2)
         name = index.photo_name(picture, frame["file_path"])
-        photos.append(Photo(name, picture, header, lens, pose_from_opengl(frame, file)))
+        photos.append(PosedPhoto(name, picture, header, lens, pose_from_opengl(frame, file)))
     notes += matches.notes
     notes += missing_photos_notes(path, photos, missing, file.name, matches.ambiguous)
     return photos

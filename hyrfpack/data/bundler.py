@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from hyrfpack.counts import format_count
-from hyrfpack.data.assemble import make_scene, unregistered_note
+from hyrfpack.data.assemble import assemble_scene, unregistered_note
 from hyrfpack.data.folder import downscale_factor
 from hyrfpack.data.pictures import PictureHeader
 from hyrfpack.data.sidecar_files import PoseEntry, find_listed_folder, find_listed_photos, find_picture_folder
@@ -77,7 +77,7 @@ def read_bundler(path: Path, *, test_every: int, max_size: int) -> Scene:
     photos, masks, notes = find_listed_photos(path, folder, entries, bundle.name)
     if len(entries) < len(names):
         notes.append(unregistered_note(len(names) - len(entries)))
-    return make_scene(
+    return assemble_scene(
         path,
         "bundler",
         photos,

@@ -16,7 +16,7 @@ from hyrfpack.scene import Picture, View
 Owner = TypeVar("Owner")
 Result = TypeVar("Result")
 
-PREFETCH_DEPTH = 4  # By default so many pictures are decoded in advance.
+DEFAULT_PREFETCHED_PICTURES = 4
 
 
 class PictureCache:
@@ -63,7 +63,7 @@ class PictureCache:
 
         Args:
             function: computes a result from pictures of the owner.
-            owner: what the pictures belong to, such as a scene. Another object that is equal counts as another owner.
+            owner: the object that the pictures belong to, such as a scene. It is compared by identity.
         """
         if self._derived is None or self._derived[0] is not function or self._derived[1] is not owner:
             self._derived = None  # frees its memory
@@ -78,14 +78,16 @@ class PictureCache:
             self.nbytes = 0
         self._derived = None
 
-    def stream(self, views: Iterable[View], depth: int = PREFETCH_DEPTH) -> Generator[tuple[View, Picture]]:
+    def stream(
+        self, views: Iterable[View], depth: int = DEFAULT_PREFETCHED_PICTURES
+    ) -> Generator[tuple[View, Picture]]:
         """Yield each view with its picture, while another thread decodes the next pictures.
 
         Leaving the loop or closing the iterator ends the thread.
 
         Args:
             views: views in the order of use; may be endless. The caller's thread takes them `depth` in advance.
-            depth: pictures that are decoded in advance; their memory is not part of the cache's limit.
+            depth: number of pictures that are decoded in advance; their memory is not part of the cache's limit.
 
         Raises:
             What `View.load` raises, when the picture's turn comes.

@@ -12,7 +12,7 @@ import numpy as np
 
 from hyrfpack.colmap_library import load_pycolmap
 from hyrfpack.counts import format_count
-from hyrfpack.data.assemble import Photo, make_scene, missing_photos_notes, unregistered_note
+from hyrfpack.data.assemble import PosedPhoto, assemble_scene, missing_photos_notes, unregistered_note
 from hyrfpack.data.colmap_binary import check_binary_model
 from hyrfpack.data.colmap_repair import read_image_names, readable_model
 from hyrfpack.data.folder import downscale_factor
@@ -72,12 +72,12 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
         notes.append(unregistered_note(unposed))
     if not len(points):
         notes.append(
-            f"the model in {tables.relative_to(path)} has no points; training looks for surfaces without them, or "
-            "starts from random positions"
+            f"the model in {tables.relative_to(path)} has no points; training finds surfaces without them, or starts "
+            "from random positions"
         )
     pictures = PictureIndex(folder)
     matches = pictures.match(names)
-    photos: list[Photo] = []
+    photos: list[PosedPhoto] = []
     missing: list[str] = []
     for name, image in zip(names, posed, strict=True):
         file = matches.found.get(name)
@@ -87,10 +87,10 @@ def read_colmap(path: Path, *, test_every: int, images: str | None, model: str |
         lens, pose = cameras[image.camera], image.camera_from_world
         listed_name = pictures.photo_name(file, name)
         visible = image.visible_points
-        photos.append(Photo(listed_name, file, read_header(file), lens, pose, visible_points=visible))
+        photos.append(PosedPhoto(listed_name, file, read_header(file), lens, pose, visible_points=visible))
     notes += matches.notes
     notes += missing_photos_notes(path, photos, missing, str(tables.relative_to(path)), matches.ambiguous)
-    return make_scene(
+    return assemble_scene(
         path,
         "colmap",
         photos,
@@ -116,30 +116,32 @@ def _photo_folder(path: Path, base: Path, images: str | None, names: Sequence[st
         raise HyrfDataError(
             f"{path}: there is no photo folder 'images' beside the COLMAP model, and no other folder is clearly the "
             f"right one ({describe_subfolders(path)})",
-            fix="choose the folder of photos with `images`, or give the folder that holds both",
+            fix="choose the folder of photos with `images`, or name the folder that holds both",
         )
     return found
 
 
 def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple[Path, list[str]]:
-    """Select the model of this name, or the one with the most photos; also return a note if there are several."""
+    """Choose the model of this name, or the one with the most photos; also return a note if there are several."""
     if not models:
-        raise HyrfDataError(f"{path}: no COLMAP model in sparse or colmap/sparse", fix="run the reconstruction first")
+        raise HyrfDataError(
+            f"{path}: there is no COLMAP model in sparse or colmap/sparse", fix="run the reconstruction first"
+        )
     if name is None and len(models) == 1:
         return models[0], []
     sizes = {model: _count_registered_photos(model) for model in models}
-    there = ", ".join(f"{model.name} ({format_count(size, 'photo')})" for model, size in sizes.items())
+    listed = ", ".join(f"{model.name} ({format_count(size, 'photo')})" for model, size in sizes.items())
     chosen = max(models, key=lambda model: sizes[model])  # max returns the first of several models of the same size
-    why = "because it has the most photos; select another with `model`"
+    reason = "because it has the most photos; select another with `model`"
     if name is not None:
         named = [model for model in models if model.name == name]
         if not named:
             raise HyrfDataError(
                 f"{path}: there is no COLMAP model '{name}'",
-                fix=f"choose one of these: {there}",
+                fix=f"choose one of these: {listed}",
             )
-        chosen, why = named[0], "as requested"
-    return chosen, [f"there are {len(models)} COLMAP models: {there}; {chosen.name} is used, {why}"]
+        chosen, reason = named[0], "as requested"
+    return chosen, [f"there are {len(models)} COLMAP models: {listed}; {chosen.name} is used, {reason}"]
 
 
 def _count_registered_photos(model: Path) -> int:

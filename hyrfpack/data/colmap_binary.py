@@ -17,6 +17,7 @@ _U64_STRUCT = struct.Struct("<Q")
 _CAMERA_STRUCT = struct.Struct("<IiQQ")  # id, model, width, height; the parameters follow as float64
 _POSE_BYTES = 7 * 8
 _SENSOR_BYTES = 4 + 4
+# Number of parameters by COLMAP's number of the camera model.
 _PARAMETER_COUNTS = {
     0: 3,
     1: 4,
@@ -30,7 +31,7 @@ _PARAMETER_COUNTS = {
     9: 5,
     10: 12,
     11: 16,
-}  # keys are COLMAP's model ids
+}
 
 
 def check_binary_model(model: Path) -> None:
@@ -71,7 +72,7 @@ class _TableReader:
             raise HyrfDataError(
                 f"{self.path}: the file ends after {len(self.data)} bytes, inside a record that extends to byte "
                 f"{self.offset}",
-                fix="it is truncated or damaged, export the model again",
+                fix="export the model again, because it is truncated or damaged",
             )
         return start
 
@@ -101,7 +102,7 @@ class _TableReader:
         if self.offset != len(self.data):
             raise HyrfDataError(
                 f"{self.path}: {len(self.data) - self.offset} bytes follow the last record that its count announces",
-                fix="it is damaged, export the model again",
+                fix="export the model again, because it is damaged",
             )
 
 

@@ -61,9 +61,8 @@ CUBE_FACES = (
     Face("right", ((0, 0, -1), (0, 1, 0), (1, 0, 0))),
     Face("back", ((-1, 0, 0), (0, 1, 0), (0, 0, -1))),
     Face("left", ((0, 0, 1), (0, 1, 0), (-1, 0, 0))),
-    Face(
-        "up", ((1, 0, 0), (0, 0, 1), (0, -1, 0))
-    ),  # camera tilted up: what is in front appears below the face's centre
+    # The camera is tilted up, so what is in front of the panorama's camera appears below the face's centre.
+    Face("up", ((1, 0, 0), (0, 0, 1), (0, -1, 0))),
     Face("down", ((1, 0, 0), (0, 0, -1), (0, 1, 0))),
 )
 
@@ -98,11 +97,10 @@ class FaceFile:
             )
         mask = None
         if self.mask is not None:
-            whole = read_mask(self.mask, *rgb.shape[:2])
-            row, column = _source_coordinates(self.face, self.size, *whole.shape)
-            mask = whole[
-                np.clip(np.rint(row), 0, len(whole) - 1).astype(int), np.rint(column).astype(int) % rgb.shape[1]
-            ]
+            panorama_mask = read_mask(self.mask, *rgb.shape[:2])
+            row, column = _source_coordinates(self.face, self.size, *panorama_mask.shape)
+            rows = np.clip(np.rint(row), 0, len(panorama_mask) - 1).astype(int)
+            mask = panorama_mask[rows, np.rint(column).astype(int) % rgb.shape[1]]
         if alpha is not None and alpha.min() < 255:
             is_opaque = cut_face(alpha[..., None], self.face, self.size)[..., 0] == 255
             mask = is_opaque if mask is None else mask & is_opaque
@@ -190,13 +188,13 @@ def cut_panorama(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -
         >>> [file.name for file in cut_panorama("street.png", "faces")][:2]
         ['street_front.jpg', 'street_right.jpg']
     """
+    from PIL import Image
+
     path = Path(path)
     size = face_size(panorama_lens(path, read_header(path)).width)
     rgb, _ = read_pixels(path)
     written = []
     for face in CUBE_FACES:
-        from PIL import Image
-
         file = Path(folder, f"{path.stem}_{face.name}.jpg")
         picture = Image.fromarray(cut_face(rgb, face, size))
         with replace_file(file) as temporary:
@@ -206,7 +204,7 @@ def cut_panorama(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -
 
 
 def panorama_lens(path: Path, header: PictureHeader) -> Lens:
-    """Return the lens of a panorama, which `make_scene` cuts into faces.
+    """Return the lens of a panorama, which `assemble_scene` cuts into faces.
 
     Raises:
         HyrfDataError: the picture is not twice as wide as high.

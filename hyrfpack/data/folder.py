@@ -247,9 +247,7 @@ def read_photo_facts(path: StrPath) -> PhotoFacts:
         try:
             exif = image.getexif()
             tags: dict[int, Any] = {**exif, **exif.get_ifd(_EXIF_IFD_TAG)}
-        except (
-            Exception
-        ):  # damaged tags make Pillow raise many types of exceptions, and the picture is usable without tags
+        except Exception:  # Pillow raises many types for damaged tags, and the picture is usable without tags
             tags = {}
     return PhotoFacts(
         path, upright, orientation, _focal_in_pixels(tags, *header.size), _device_name(tags), _capture_time(tags)

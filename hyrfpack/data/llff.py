@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrfpack.data.assemble import make_scene
+from hyrfpack.data.assemble import assemble_scene
 from hyrfpack.data.pictures import is_picture_name
 from hyrfpack.data.sidecar_files import PoseEntry, find_listed_photos, find_picture_folder
 from hyrfpack.data.transforms import pose_from_camera_axes
@@ -60,7 +60,7 @@ def read_llff(path: Path, *, test_every: int, images: str | None, max_size: int)
         lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2)
         entries.append((name, lens, pose_from_camera_axes(np.stack((right, down, -back), 1), matrix[:, 3])))
     photos, masks, found = find_listed_photos(path, folder, entries, POSES_FILE)
-    return make_scene(
+    return assemble_scene(
         path,
         "llff",
         photos,

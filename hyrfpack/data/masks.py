@@ -19,7 +19,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class MaskedPhoto:
-    """A photo with a mask, as far as it matters for how the mask is turned.
+    """A photo with a mask, for the choice of the orientation by which the mask is turned.
 
     Attributes:
         mask: the file of the mask.
@@ -73,15 +73,14 @@ def find_masks(
     unmatched = [file for file in unmatched if file not in matched]
     if by_photo or used or not allow_shared:
         return MaskMatches(by_photo, _unmatched_mask_notes(folder, unmatched, len(index.files), names))
-    for_all = unmatched
+    shared_candidates = unmatched
     if not folder.is_dir():
-        for_all = [file for file in folder.parent.glob("[mM][aA][sS][kK].*") if is_picture_name(file.name)]
-    if len(for_all) == 1 and len(photos) > 1:
-        header, path = read_header(for_all[0]), for_all[0].relative_to(folder.parent)
+        shared_candidates = [file for file in folder.parent.glob("[mM][aA][sS][kK].*") if is_picture_name(file.name)]
+    if len(shared_candidates) == 1 and len(photos) > 1:
+        shared = shared_candidates[0]
+        header, path = read_header(shared), shared.relative_to(folder.parent)
         if all(has_same_aspect(*header.size, *size) for _, size in photos):
-            return MaskMatches(
-                dict.fromkeys(names, for_all[0]), [f"{path} is the only mask and is used for all photos"]
-            )
+            return MaskMatches(dict.fromkeys(names, shared), [f"{path} is the only mask and is used for all photos"])
         return MaskMatches(
             {},
             [
@@ -157,7 +156,7 @@ def choose_mask_orientations(photos: Sequence[MaskedPhoto]) -> list[int]:
             raise HyrfDataError(
                 f"{photo.mask}: the mask is {header.width} x {header.height} but its photo {photo.size[0]} x "
                 f"{photo.size[1]}",
-                fix="make it the photo's size",
+                fix="resize it to the photo's size",
             )
     fits = list(zip(fits_upright, fits_stored, strict=True))
     are_ambiguous_stored = (False, True) in fits or (True, False) not in fits
@@ -168,7 +167,7 @@ def choose_mask_orientations(photos: Sequence[MaskedPhoto]) -> list[int]:
 
 
 def _unmatched_mask_notes(folder: Path, unmatched: list[Path], count: int, names: list[str]) -> list[str]:
-    """Return a list with a note about masks that match no photo; the list is empty if there are none."""
+    """Return a list of one note about masks that match no photo; an empty list if there are none."""
     if not unmatched:
         return []
     of_masks = f"of {count} masks in {folder.name}"

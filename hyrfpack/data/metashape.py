@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from hyrfpack.counts import format_count
-from hyrfpack.data.assemble import make_scene
+from hyrfpack.data.assemble import assemble_scene
 from hyrfpack.data.equirectangular import panorama_lens
 from hyrfpack.data.pictures import PictureHeader
 from hyrfpack.data.sidecar_files import (
@@ -113,7 +113,7 @@ def read_metashape(path: Path, *, test_every: int, images: str | None, max_size:
         left_out = "no pose in the chosen component and"
         notes.append(f"{format_count(unposed, f'photo has {left_out} was', f'photos have {left_out} were')} skipped")
     points, colors, tables = read_sidecar_points(path, photos, notes)
-    return make_scene(
+    return assemble_scene(
         path,
         "metashape",
         photos,

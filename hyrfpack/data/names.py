@@ -47,12 +47,14 @@ class NameMatches:
         if self.inexact:
             first = self.inexact[0]
             file = Path(os.path.relpath(self.found[first], self.folder)).as_posix()
-            accents = " in another form of Unicode" if _normalize_unicode(file) == _normalize_unicode(first) else ""
+            unicode_note = (
+                " in another form of Unicode" if _normalize_unicode(file) == _normalize_unicode(first) else ""
+            )
             of = f"of {len(self.found)} photos"
             differ = "other names than in the poses and"
             notes.append(
                 f"{format_count(len(self.inexact), f'{of} has {differ} was', f'{of} have {differ} were')} "
-                f"matched to the only file that fits (such as {first} to {file}{accents})"
+                f"matched to the only file that fits (such as {first} to {file}{unicode_note})"
             )
         if self.ambiguous:
             notes.append(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hyrfpack.cameras.files import focal_entries, focal_lengths
-from hyrfpack.data.assemble import Photo, make_scene, missing_photos_notes
+from hyrfpack.data.assemble import PosedPhoto, assemble_scene, missing_photos_notes
 from hyrfpack.data.equirectangular import panorama_lens
 from hyrfpack.data.masks import find_mask_folder
 from hyrfpack.data.names import NameMatches, PictureIndex, path_parts, safe_name
@@ -55,7 +55,7 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size
     frames = content["frames"]
     if images is not None:
         find_picture_folder(path, images)
-    keep, test_names, notes = _listed_split(content, file)
+    keep, test_names, notes = _read_split(content, file)
     frames = [frame for frame in frames if keep is None or PurePosixPath(frame["file_path"]) in keep]
     strip = _common_folder([frame["file_path"] for frame in content["frames"]])
     pictures, matches = _find_pictures(path, [frame["file_path"] for frame in frames], strip, images)
@@ -64,7 +64,7 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size
     if is_moved and images is None:
         where = "the folder itself" if pictures == path else pictures.name
         notes.append(f"the photos are not where {file.name} says; those in {where} are used")
-    photos: list[Photo] = []
+    photos: list[PosedPhoto] = []
     missing: list[str] = []
     test: set[str] = set()
     for frame in frames:
@@ -84,12 +84,12 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size
                 _check_scale_is_known(content, frame, file)
             lens = _lens(content, frame, header, file)
         mask = _listed_mask(masks, frame, name, file)
-        photos.append(Photo(name, picture, header, lens, pose_from_opengl(frame, file), mask))
+        photos.append(PosedPhoto(name, picture, header, lens, pose_from_opengl(frame, file), mask))
     notes += matches.notes
     notes += missing_photos_notes(path, photos, missing, file.name, matches.ambiguous)
     points, colors = _read_points(path, content, file)
     tables = [file] if points is None else [file, path / with_forward_slashes(content["ply_file_path"])]
-    return make_scene(
+    return assemble_scene(
         path,
         "nerfstudio",
         photos,
@@ -104,7 +104,7 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size
     )
 
 
-def _listed_split(content: dict[str, Any], file: Path) -> tuple[set | None, set, list[str]]:
+def _read_split(content: dict[str, Any], file: Path) -> tuple[set | None, set, list[str]]:
     """Read the file's own split.
 
     Returns:
@@ -138,9 +138,8 @@ def _common_folder(listed: list[str]) -> PurePosixPath:
     firsts = {PurePosixPath(name).parts[:1] for name in listed if len(PurePosixPath(name).parts) > 1}
     has_bare_name = any(len(PurePosixPath(name).parts) < 2 for name in listed)
     first = PurePosixPath(*next(iter(firsts))) if len(firsts) == 1 and not has_bare_name else PurePosixPath()
-    return (
-        first if path_parts(str(first)) or first.name == ".." else PurePosixPath()
-    )  # a root or a drive is not a folder
+    is_folder = path_parts(str(first)) or first.name == ".."  # a root or a drive is not a folder
+    return first if is_folder else PurePosixPath()
 
 
 def _find_pictures(path: Path, listed: list[str], strip: PurePosixPath, images: str | None) -> tuple[Path, NameMatches]:
@@ -240,7 +239,7 @@ def _listed_mask(masks: PictureIndex, frame: dict[str, Any], name: str, file: Pa
     if mask is None:
         raise HyrfDataError(
             f"{file}: mask {str(listed)[:80]} of {name} is not on disk",
-            fix="restore it or drop 'mask_path'",
+            fix="restore it, or remove 'mask_path'",
         )
     return mask
 
@@ -254,6 +253,6 @@ def _read_points(path: Path, content: dict[str, Any], file: Path) -> tuple[np.nd
     if not isinstance(listed, str) or not os.path.isfile(ply):  # Path.is_file raises if a name is too long
         raise HyrfDataError(
             f"{file}: points {str(listed)[:80]} are not on disk",
-            fix="restore them or drop 'ply_file_path'",
+            fix="restore them, or remove 'ply_file_path'",
         )
     return read_ply_points(ply)

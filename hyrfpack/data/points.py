@@ -39,15 +39,15 @@ def read_ply_points(ply: Path) -> tuple[np.ndarray, np.ndarray]:
         ) from error
     header = read_header(data, name)
     vertex = header.elements.get("vertex")
-    kinds = vertex.properties if vertex else {}
-    if not all(kinds.get(label) for label in _POSITION_PROPERTIES):
+    types = vertex.properties if vertex else {}
+    if not all(types.get(label) for label in _POSITION_PROPERTIES):
         raise HyrfDataError(f"{name}: the file has no points, or they lack x, y or z", fix="export them again")
     rows = read_elements(data, header, {"vertex"}, name)["vertex"]
     points = stack_columns(rows, _POSITION_PROPERTIES).astype(np.float64)
-    if not all(kinds.get(label) for label in _COLOR_PROPERTIES):
+    if not all(types.get(label) for label in _COLOR_PROPERTIES):
         return points, np.full_like(points, _DEFAULT_COLOR)
     # The header gives the type of the values, because rows of text files are float64 in any case.
-    color_types = [kinds[label] for label in _COLOR_PROPERTIES]
+    color_types = [types[label] for label in _COLOR_PROPERTIES]
     colors = stack_columns(rows, _COLOR_PROPERTIES).astype(np.float64)
     max_values = [1.0 if kind[0] == "f" else np.iinfo(kind).max for kind in color_types]
     largest = colors[np.isfinite(colors)].max(initial=0)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from hyrfpack.data.assemble import make_scene
+from hyrfpack.data.assemble import assemble_scene
 from hyrfpack.data.sidecar_files import PoseEntry, find_listed_photos
 from hyrfpack.data.transforms import finite_number, pose_from_opengl, read_json_object
 from hyrfpack.data.undistort import Lens
@@ -56,7 +56,7 @@ def read_polycam(path: Path, *, test_every: int, max_size: int) -> Scene:
         pose = pose_from_opengl({"file_path": table.stem, "transform_matrix": rows}, table)
         entries.append((table.stem, lens, pose))
     photos, masks, found = find_listed_photos(path, path / images, entries, cameras)
-    return make_scene(
+    return assemble_scene(
         path,
         "polycam",
         photos,

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrfpack.data.assemble import make_scene
+from hyrfpack.data.assemble import assemble_scene
 from hyrfpack.data.pictures import PictureHeader
 from hyrfpack.data.sidecar_files import (
     PoseEntry,
@@ -74,7 +74,7 @@ def read_realityscan(path: Path, *, test_every: int, images: str | None, max_siz
         entries.append((name, partial(_lens, row), _pose(pose)))
     photos, masks, notes = find_listed_photos(path, find_picture_folder(path, images), entries, table.name)
     points, colors, tables = read_sidecar_points(path, photos, notes)
-    return make_scene(
+    return assemble_scene(
         path,
         "realityscan",
         photos,

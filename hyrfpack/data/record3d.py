@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hyrfpack.data.assemble import make_scene
+from hyrfpack.data.assemble import assemble_scene
 from hyrfpack.data.sidecar_files import PoseEntry, find_listed_photos
 from hyrfpack.data.transforms import finite_number, pose_from_camera_axes, read_json_object
 from hyrfpack.data.undistort import Lens
@@ -68,7 +68,7 @@ def read_record3d(path: Path, *, test_every: int, max_size: int) -> Scene:
         axes = _rotation(pose[:4]) * (1, -1, -1)
         entries.append((f"{frame}.jpg", lens, pose_from_camera_axes(axes, pose[4:])))
     photos, masks, notes = find_listed_photos(path, folder, entries, table.name)
-    return make_scene(
+    return assemble_scene(
         path,
         "record3d",
         photos,

@@ -88,23 +88,23 @@ def find_photo_folder(path: Path) -> Path | None:
     return others[0] if len(others) == 1 else None
 
 
-def find_set(path: Path, holds: Callable[[Path], bool]) -> Path | None:
-    """Find the only folder below `path` for which `holds` is true, None if there is none.
+def find_only_subfolder(path: Path, has_poses: Callable[[Path], bool]) -> Path | None:
+    """Find the only folder below `path` that has poses, None if there is none.
 
     Archives often have such a single top folder.
 
     Raises:
-        HyrfDataError: several folders of one level hold a dataset.
+        HyrfDataError: several folders of one level have poses.
     """
     level = [path]
     for _ in range(_MAX_SEARCH_DEPTH):
         level = [inside for folder in level for inside in _subfolders(folder)][:_MAX_FOLDERS_PER_LEVEL]
-        sets = [folder for folder in level if holds(folder)]
+        sets = [folder for folder in level if has_poses(folder)]
         if len(sets) > 1:
             some = ", ".join(str(folder.relative_to(path)) for folder in sets[:4])
             raise HyrfDataError(
                 f"{path}: holds {len(sets)} sets of photos with poses ({some}{', ...' if len(sets) > 4 else ''})",
-                fix="give the folder of one of them",
+                fix="name the folder of one of them",
             )
         if sets:
             return sets[0]
@@ -112,7 +112,7 @@ def find_set(path: Path, holds: Callable[[Path], bool]) -> Path | None:
 
 
 def describe_subfolders(path: Path) -> str:
-    """Describe the subfolders of a folder, for messages that ask for one of them."""
+    """Describe the subfolders of a folder, for messages that ask the user to name one of them."""
     names = [entry.name for entry in _subfolders(path)]
     if len(names) == 1:
         return f"the only folder there is {names[0]}"
@@ -136,9 +136,8 @@ def _models_in(base: Path) -> list[Path]:
 
 def _holds_photos(folder: Path) -> bool:
     """Return whether a folder or one of its subfolders holds photos."""
-    if any(
-        is_picture_name(name) for name in _list_names(folder)
-    ):  # the usual case, which needs no search of subfolders
+    # In the usual case, photos lie in the folder itself, and no subfolder is searched.
+    if any(is_picture_name(name) for name in _list_names(folder)):
         return True
     try:
         return bool(list_photos(folder))

@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from hyrfpack.data.assemble import Photo, missing_photos_notes
+from hyrfpack.data.assemble import PosedPhoto, missing_photos_notes
 from hyrfpack.data.masks import find_mask_folder
 from hyrfpack.data.names import PictureIndex, path_parts, safe_name
 from hyrfpack.data.pictures import PictureHeader, read_header
@@ -48,7 +48,7 @@ def find_picture_folder(path: Path, images: str | None) -> Path:
     if not os.path.isdir(path / images):  # Path.is_dir raises if a name is too long
         raise HyrfDataError(
             f"{path}: there is no photo folder '{images}', and {describe_subfolders(path)}",
-            fix="use another folder of photos as `images`",
+            fix="name another folder of photos with `images`",
         )
     return path / images
 
@@ -67,7 +67,7 @@ def find_listed_folder(path: Path, names: Iterable[str]) -> Path | None:
 
 def find_listed_photos(
     path: Path, folder: Path, entries: Sequence[PoseEntry], where: str
-) -> tuple[list[Photo], Path, list[str]]:
+) -> tuple[list[PosedPhoto], Path, list[str]]:
     """Find the files of the photos that a table lists and read their headers.
 
     Args:
@@ -85,7 +85,7 @@ def find_listed_photos(
     pictures, relative_folder = PictureIndex(folder), PurePosixPath(Path(os.path.relpath(folder, path)).as_posix())
     names = [safe_name(listed).removeprefix(f"{relative_folder}/") for listed, _, _ in entries]
     matches = pictures.match(names)
-    photos: list[Photo] = []
+    photos: list[PosedPhoto] = []
     missing: list[str] = []
     for name, (_, lens, pose) in zip(names, entries, strict=True):
         file = matches.found.get(name)
@@ -94,13 +94,13 @@ def find_listed_photos(
             continue
         header = read_header(file)
         lens = lens(file, header) if callable(lens) else lens
-        photos.append(Photo(pictures.photo_name(file, name), file, header, lens, pose))
+        photos.append(PosedPhoto(pictures.photo_name(file, name), file, header, lens, pose))
     notes = matches.notes + missing_photos_notes(path, photos, missing, where, matches.ambiguous)
     return photos, find_mask_folder(path, folder.name), notes
 
 
 def read_sidecar_points(
-    path: Path, photos: Sequence[Photo], notes: list[str]
+    path: Path, photos: Sequence[PosedPhoto], notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray, list[Path]]:
     """Read the points of the only `.ply` file in a folder, if the cameras look at them.
 
@@ -117,29 +117,31 @@ def read_sidecar_points(
     if not files:
         return none
     if len(files) > 1:
-        notes.append(f"there are {len(files)} .ply files and none is marked as the one with the points; none is used")
+        notes.append(
+            f"there are {len(files)} .ply files, of which any may hold the points of the cameras, so none is used"
+        )
         return none
     points, colors = read_ply_points(files[0])
     if not len(points) or not _are_in_view(points, photos):
         notes.append(
-            f"the points of {files[0].name} are not where the cameras look and are not used; "
+            f"the points of {files[0].name} do not lie where the cameras look and are not used; "
             "export them in the coordinate system of the cameras"
         )
         return none
     return points, colors, [files[0]]
 
 
-def _are_in_view(points: np.ndarray, photos: Sequence[Photo]) -> bool:
+def _are_in_view(points: np.ndarray, photos: Sequence[PosedPhoto]) -> bool:
     """Return whether half of the points lie in or near the picture of a camera and at a plausible distance."""
-    sample = points[np.linspace(0, len(points) - 1, min(len(points), _MAX_SAMPLED_POINTS)).astype(int)]
+    sampled = points[np.linspace(0, len(points) - 1, min(len(points), _MAX_SAMPLED_POINTS)).astype(int)]
     cameras = evenly_spaced(photos, _MAX_SAMPLED_CAMERAS)
-    seen = np.zeros(len(sample), bool)
+    seen = np.zeros(len(sampled), bool)
     with np.errstate(all="ignore"):
         positions = np.array([-photo.camera_from_world[:3, :3].T @ photo.camera_from_world[:3, 3] for photo in cameras])
-        distance = np.median(np.linalg.norm(sample - np.median(positions, axis=0), axis=1))
+        distance = np.median(np.linalg.norm(sampled - np.median(positions, axis=0), axis=1))
         extent = np.linalg.norm(np.ptp(positions, axis=0))
         for photo in cameras:
-            local = sample @ photo.camera_from_world[:3, :3].T + photo.camera_from_world[:3, 3]
+            local = sampled @ photo.camera_from_world[:3, :3].T + photo.camera_from_world[:3, 3]
             lens = photo.lens
             u = lens.fx * local[:, 0] / local[:, 2] + lens.cx
             v = lens.fy * local[:, 1] / local[:, 2] + lens.cy

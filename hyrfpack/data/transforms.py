@@ -116,8 +116,8 @@ def pose_from_opengl(frame: dict[str, Any], path: Path) -> np.ndarray:
 def pose_from_camera_axes(axes: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Return the (4, 4) camera_from_world of a camera from its axes and its position in the world.
 
-    The axes are inverted by transposition, without a check that they are orthonormal. `make_scene` rejects poses that
-    are not rigid.
+    The axes are inverted by transposition, without a check that they are orthonormal. `assemble_scene` rejects poses
+    that are not rigid.
 
     Args:
         axes: (3, 3) matrix whose columns are the camera's OpenCV axes.

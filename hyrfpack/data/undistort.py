@@ -87,21 +87,21 @@ def distort(lens: Lens, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nd
         (x', y') of the same shape; the photo's pixel is (fx x' + cx, fy y' + cy).
     """
     if lens.model == "pinhole":
-        bent_x, bent_y = x, y
+        distorted_x, distorted_y = x, y
     elif lens.model == "fisheye":
         r = np.sqrt(x * x + y * y)
         theta = np.arctan(r)
         scale = np.divide(_fisheye_angle(lens, theta), r, out=np.ones_like(r), where=r > 1e-9)
-        bent_x, bent_y = x * scale, y * scale
+        distorted_x, distorted_y = x * scale, y * scale
         if len(lens.coefficients) > 4:
-            flat = np.divide(theta, r, out=np.ones_like(r), where=r > 1e-9)
-            off_x, off_y = _tangential_offset(lens.coefficients[4:6], x * flat, y * flat)
-            bent_x, bent_y = bent_x + off_x, bent_y + off_y
+            angle_ratio = np.divide(theta, r, out=np.ones_like(r), where=r > 1e-9)
+            offset_x, offset_y = _tangential_offset(lens.coefficients[4:6], x * angle_ratio, y * angle_ratio)
+            distorted_x, distorted_y = distorted_x + offset_x, distorted_y + offset_y
     else:
         d = _brown_factor(lens, x * x + y * y)
-        off_x, off_y = _tangential_offset(lens.coefficients[2:4], x, y)
-        bent_x, bent_y = x * d + off_x, y * d + off_y
-    return (bent_x + lens.skew / lens.fx * bent_y if lens.skew else bent_x), bent_y
+        offset_x, offset_y = _tangential_offset(lens.coefficients[2:4], x, y)
+        distorted_x, distorted_y = x * d + offset_x, y * d + offset_y
+    return (distorted_x + lens.skew / lens.fx * distorted_y if lens.skew else distorted_x), distorted_y
 
 
 def _tangential_offset(tangential: tuple[float, ...], x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -133,10 +133,10 @@ def fold_radius(lens: Lens, largest: float) -> float:
     radii = np.linspace(0, largest, 4096)
     with np.errstate(over="ignore", invalid="ignore"):
         if lens.model == "fisheye":
-            bent = _fisheye_angle(lens, np.arctan(radii))
+            distorted = _fisheye_angle(lens, np.arctan(radii))
         else:
-            bent = radii * _brown_factor(lens, radii * radii)
-        folded = np.flatnonzero(~(np.diff(bent) > 0))
+            distorted = radii * _brown_factor(lens, radii * radii)
+        folded = np.flatnonzero(~(np.diff(distorted) > 0))
     return float(radii[folded[0]]) if folded.size else largest
 
 
@@ -152,12 +152,11 @@ def _source_map(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     y = ((np.arange(lens.height) + 0.5 - lens.cy) / lens.fy)[:, None]
     x, y = np.broadcast_arrays(x, y)
     radius = np.hypot(x, y)
-    largest = float(radius.max())
     with np.errstate(over="ignore", invalid="ignore"):
-        bent_x, bent_y = distort(lens, x, y)
-        u, v = lens.fx * bent_x + lens.cx, lens.fy * bent_y + lens.cy
+        distorted_x, distorted_y = distort(lens, x, y)
+        u, v = lens.fx * distorted_x + lens.cx, lens.fy * distorted_y + lens.cy
         seen = (u >= 0) & (u <= lens.width) & (v >= 0) & (v <= lens.height)  # comparisons with NaN are false
-    seen &= radius <= fold_radius(lens, largest)
+    seen &= radius <= fold_radius(lens, float(radius.max()))
     column = np.where(seen, np.clip(u - 0.5, 0, lens.width - 1), 0).astype(np.float32)
     row = np.where(seen, np.clip(v - 0.5, 0, lens.height - 1), 0).astype(np.float32)
     return column, row, None if seen.all() else seen

@@ -37,7 +37,7 @@ def raise_if_single_photo(path: Path) -> None:
 
 
 def raw_photos_notes(raw_photos: Sequence[Path]) -> list[str]:
-    """Return a list with a note about ignored raw files beside photos; the list is empty if there are none."""
+    """Return a list of one note about ignored raw files beside photos; an empty list if there are none."""
     if not raw_photos:
         return []
     noun, verb = ("raw file", "is") if len(raw_photos) == 1 else ("raw files", "are")
@@ -83,9 +83,10 @@ def _unreadable_problems(reasons: Mapping[str, str], count: int) -> list[tuple[s
         if names:
             problems.append((f"{_cannot_be_read(names, count)} ({known_reason})", remedy))
     if other:
-        first, it = reasons[other[0]], "it" if len(other) == 1 else "them"
-        reason = first if len({reasons[name] for name in other}) == 1 else f"{other[0]}: {first}"
-        problems.append((f"{_cannot_be_read(other, count)} ({reason})", f"copy {it} again, or remove {it}"))
+        reason, pronoun = reasons[other[0]], "it" if len(other) == 1 else "them"
+        if len({reasons[name] for name in other}) > 1:
+            reason = f"{other[0]}: {reason}"
+        problems.append((f"{_cannot_be_read(other, count)} ({reason})", f"copy {pronoun} again, or remove {pronoun}"))
     return problems
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.config.train import DensityConfig
-from hyrfpack.data.cache import PREFETCH_DEPTH
+from hyrfpack.data.cache import DEFAULT_PREFETCHED_PICTURES
 from hyrfpack.data.reduced import reduce_view
 from hyrfpack.ops.rasterize.inputs import LOW_PASS_VARIANCE
 from hyrfpack.render import RenderSettings
@@ -76,7 +76,7 @@ class ResolutionSchedule:
         """Take the number of Gaussians after a step; the resolution only grows."""
         factor = self._size.reduction_for(gaussians)
         if factor < self.changes[-1][1]:
-            self.changes.append((step + PREFETCH_DEPTH + 1, factor))
+            self.changes.append((step + DEFAULT_PREFETCHED_PICTURES + 1, factor))
 
     def factor(self, step: int) -> int:
         """Return the factor of a step, counted from 1."""

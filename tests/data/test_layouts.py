@@ -185,7 +185,7 @@ def test_points_of_another_frame_are_not_used(tmp_path, write, layout):
     scene = load_scene(tmp_path)
 
     assert len(scene.points) == 0
-    assert any(f"the points of {file.name} are not where the cameras look" in note for note in scene.notes)
+    assert any(f"the points of {file.name} do not lie where the cameras look" in note for note in scene.notes)
 
 
 @pytest.mark.parametrize("layout", WRITERS_BY_LAYOUT)

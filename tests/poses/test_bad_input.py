@@ -132,7 +132,7 @@ def test_masks_of_another_shape_are_refused_before_photos_are_copied(tmp_path):
     photos = save_pictures(tmp_path / "photos", random_pictures(4))
     save_pictures(photos / "masks", [np.full((120, 120), 255, np.uint8)] * 4)
     sentence = refused("poses", photos, "-o", tmp_path / "scene")
-    assert "00.png: the mask is 120 x 120 but its photo 160 x 120; make it the photo's size" in sentence
+    assert "00.png: the mask is 120 x 120 but its photo 160 x 120; resize it to the photo's size" in sentence
     assert not (tmp_path / "scene").exists()
 
 

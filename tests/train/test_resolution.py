@@ -6,7 +6,7 @@ import torch
 from scenes import ball_points, small_model
 
 from hyrfpack.config.train import DensityConfig, TrainConfig
-from hyrfpack.data.cache import PREFETCH_DEPTH
+from hyrfpack.data.cache import DEFAULT_PREFETCHED_PICTURES
 from hyrfpack.data.reduced import reduce_camera
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera, Picture, Scene, View
@@ -50,8 +50,8 @@ def test_the_resolution_grows_with_the_gaussians_and_never_falls() -> None:
     schedule.update(300, few)
 
     assert coarsest == LARGE_PHOTO.reduction_for(100) > 1
-    assert [schedule.factor(step) for step in (100, 200, 200 + PREFETCH_DEPTH)] == [coarsest] * 3
-    assert [schedule.factor(step) for step in (201 + PREFETCH_DEPTH, 400, 1000)] == [1] * 3
+    assert [schedule.factor(step) for step in (100, 200, 200 + DEFAULT_PREFETCHED_PICTURES)] == [coarsest] * 3
+    assert [schedule.factor(step) for step in (201 + DEFAULT_PREFETCHED_PICTURES, 400, 1000)] == [1] * 3
 
 
 def test_the_last_steps_are_at_full_resolution() -> None:
@@ -64,7 +64,9 @@ def test_the_last_steps_are_at_full_resolution() -> None:
 def test_only_changes_that_took_effect_are_described() -> None:
     schedule = ResolutionSchedule([make_view(1600, 1066)], 30, 100)
     middle = LARGE_PHOTO.pixels / 4
-    schedule.update(24 - PREFETCH_DEPTH, int(middle))  # takes effect at step 25, which is at full resolution anyway
+    schedule.update(
+        24 - DEFAULT_PREFETCHED_PICTURES, int(middle)
+    )  # takes effect at step 25, which is at full resolution anyway
 
     assert [schedule.factor(step) for step in (1, 24, 25)] == [4, 4, 1]
     assert schedule.describe() == "photos reduced by 4 until step 24"
@@ -80,7 +82,7 @@ def test_each_part_of_a_run_is_described_with_its_last_step() -> None:
     schedule = ResolutionSchedule([make_view(1600, 1066)], 1000, 100)
     schedule.update(200, int(LARGE_PHOTO.pixels / 4))
 
-    last = 200 + PREFETCH_DEPTH
+    last = 200 + DEFAULT_PREFETCHED_PICTURES
     assert [schedule.factor(step) for step in (last, last + 1, 800, 801)] == [4, 2, 2, 1]
     assert schedule.describe() == f"photos reduced by 4 until step {last}, by 2 until step 800"
 
@@ -202,7 +204,7 @@ def test_a_resumed_run_takes_the_same_steps_when_the_resolution_changes(tmp_path
     whole.run()
     changed = whole.resolution.changes[1][0]
     # Before photos of the new size are prefetched, with the first of them, and after the last step of the old size.
-    for stop in (max(1, changed - PREFETCH_DEPTH - 1), changed - PREFETCH_DEPTH, changed):
+    for stop in (max(1, changed - DEFAULT_PREFETCHED_PICTURES - 1), changed - DEFAULT_PREFETCHED_PICTURES, changed):
         first = Trainer(make_large_scene(), SHORT_RUN)
         first.run(checkpoint=tmp_path / "c.pt", stop=lambda trainer=first, stop=stop: trainer.step >= stop)
         second = Trainer(make_large_scene(), SHORT_RUN)
