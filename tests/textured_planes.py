@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hyrfpack.scene import Camera
-from hyrfpack.stereo import Photo
+from hyrfpack.stereo import StereoPhoto
 
 PICTURE_WIDTH, PICTURE_HEIGHT = 64, 48
 
@@ -45,7 +45,7 @@ def depths_of_planes(camera: Camera, planes) -> tuple[np.ndarray, np.ndarray]:
     return depth, grey
 
 
-def photograph(camera: Camera, planes, points: np.ndarray) -> Photo:
+def photograph(camera: Camera, planes, points: np.ndarray) -> StereoPhoto:
     """Return a photo of planes z = distance + slope x with left <= x <= right, given as such tuples of four numbers.
 
     The photo shows those of `points` that lie in its picture.
@@ -53,4 +53,4 @@ def photograph(camera: Camera, planes, points: np.ndarray) -> Photo:
     _, grey = depths_of_planes(camera, planes)
     x, y, z = camera.project(points)
     shown = np.flatnonzero(camera.in_picture(x, y, z))
-    return Photo(camera, grey.astype(np.float32), np.ones(grey.shape, bool), shown)
+    return StereoPhoto(camera, grey.astype(np.float32), np.ones(grey.shape, bool), shown)

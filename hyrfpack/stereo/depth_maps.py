@@ -1,4 +1,4 @@
-"""Estimate the depths of a photo's pixels from other photos, and count how many of these agree."""
+"""Estimate the depths of a photo's pixels from other photos, and count how many photos confirm each depth."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from hyrfpack.scene import Camera
 from hyrfpack.stereo.sources import choose_sources
 
 PLANE_COUNT = 64
-# The depth of the nearest plane, as a share of the depth of the photo's near points.
+# The depth of the nearest plane is this ratio of the depth at this quantile of the photo's points.
 NEAREST_PLANE_DEPTH_RATIO = 0.6
 NEAR_POINT_QUANTILE = 0.02
-MAX_DIFFERENCE_PLANES = 1.5  # Depths agree if they differ by at most this.
-# Points at or near infinity are compared at the depth of this share of the first plane before infinity.
-MIN_COMPARED_PLANES = 0.25
+MAX_DIFFERENCE_PLANES = 1.5  # depths agree if their inverses differ by at most as many plane spacings
+# A point at infinity has no position, so inverse depths are raised to this many plane spacings for the comparison.
+MIN_COMPARED_INVERSE_DEPTH_PLANES = 0.25
 
 
 @dataclass(frozen=True)
-class Photo:
-    """A photo as its depths are estimated.
+class StereoPhoto:
+    """A photo, reduced to what the estimation of depths reads.
 
     Attributes:
         camera: its camera.
@@ -47,13 +47,13 @@ class InverseDepthMap:
         sources: indices of the photos that it was compared with.
     """
 
-    photo: Photo
+    photo: StereoPhoto
     inverse_depths: np.ndarray
     spacing: float
     sources: list[int]
 
 
-def estimate_depth_maps(photos: Sequence[Photo], points: np.ndarray) -> list[InverseDepthMap | None]:
+def estimate_depth_maps(photos: Sequence[StereoPhoto], points: np.ndarray) -> list[InverseDepthMap | None]:
     """Estimate the depth maps of photos by plane sweep and semi-global matching.
 
     PLANE_COUNT planes have evenly spaced inverse depths, from 0 to 1 / z with z = NEAREST_PLANE_DEPTH_RATIO times the
@@ -63,7 +63,7 @@ def estimate_depth_maps(photos: Sequence[Photo], points: np.ndarray) -> list[Inv
 
     Args:
         photos: N photos.
-        points: (P, 3) world positions of the points of `Photo.points`.
+        points: (P, 3) world positions of the points of `StereoPhoto.points`.
 
     Returns:
         N depth maps; None for a photo that shows no point, or for which there are no suitable source photos.
@@ -72,11 +72,14 @@ def estimate_depth_maps(photos: Sequence[Photo], points: np.ndarray) -> list[Inv
         ImportError: Numba is missing.
     """
     sources = choose_sources([photo.camera for photo in photos], points, [photo.points for photo in photos])
-    return [_estimate(photo, points, photos, near) for photo, near in zip(photos, sources, strict=True)]
+    return [_estimate_depth_map(photo, points, photos, own) for photo, own in zip(photos, sources, strict=True)]
 
 
-def _estimate(photo: Photo, points: np.ndarray, photos: Sequence[Photo], sources: list[int]) -> InverseDepthMap | None:
-    from hyrfpack.stereo.aggregate import aggregate_costs  # Compiled code, without which a model can be packed.
+def _estimate_depth_map(
+    photo: StereoPhoto, points: np.ndarray, photos: Sequence[StereoPhoto], sources: list[int]
+) -> InverseDepthMap | None:
+    """Estimate the depth map of one photo from its source photos, whose indices are `sources`."""
+    from hyrfpack.stereo.aggregate import aggregate_costs  # imported here, because packing a model does not need Numba
     from hyrfpack.stereo.cost import compute_cost_volume
 
     _, _, z = photo.camera.project(points[photo.points])
@@ -90,31 +93,33 @@ def _estimate(photo: Photo, points: np.ndarray, photos: Sequence[Photo], sources
     total = aggregate_costs(volume, photo.grey)
     best = total.argmin(-1)
     middle = np.clip(best, 1, PLANE_COUNT - 2)
-    previous, at, following = (np.take_along_axis(total, (middle + step)[..., None], -1)[..., 0] for step in (-1, 0, 1))
-    curvature = np.maximum(previous - 2 * at + following, 1e-6)
+    previous, centre, following = (
+        np.take_along_axis(total, (middle + step)[..., None], -1)[..., 0] for step in (-1, 0, 1)
+    )
+    curvature = np.maximum(previous - 2 * centre + following, 1e-6)
     shift = np.where(best == middle, np.clip((previous - following) / (2 * curvature), -0.5, 0.5), 0)
     spacing = float(planes[1])
     return InverseDepthMap(photo, (best + shift) * spacing, spacing, sources)
 
 
-def count_agreeing(maps: Sequence[InverseDepthMap | None], index: int) -> np.ndarray:
-    """Count for each pixel of a depth map how many of its source photos see its point at the same depth.
+def count_agreeing_sources(maps: Sequence[InverseDepthMap | None], index: int) -> np.ndarray:
+    """Count for each pixel of a depth map the source photos that see its point at the same depth.
 
     A source photo agrees if the point lies in a usable pixel of it, and its inverse depth differs by at most
     MAX_DIFFERENCE_PLANES of the source photo's planes from that of its depth map (geometric consistency).
 
     Args:
         maps: all depth maps.
-        index: which of them; not None.
+        index: index of the depth map, which is not None.
 
     Returns:
-        (H, W) int64.
+        (H, W) int64 numbers of source photos.
     """
     depth_map = maps[index]
     assert depth_map is not None
     height, width = depth_map.inverse_depths.shape
     y, x = (np.mgrid[:height, :width] + 0.5).reshape(2, -1)
-    z = 1 / np.maximum(depth_map.inverse_depths.ravel(), MIN_COMPARED_PLANES * depth_map.spacing)
+    z = 1 / np.maximum(depth_map.inverse_depths.ravel(), MIN_COMPARED_INVERSE_DEPTH_PLANES * depth_map.spacing)
     points = depth_map.photo.camera.unproject(x, y, z)
     votes = np.zeros(height * width, np.int64)
     for source in depth_map.sources:

@@ -30,13 +30,13 @@ from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.survey.measure import measure_pixels, read_header_facts, relative_name
 from hyrfpack.survey.problems import (
+    describe_headers,
     find_blur_problems,
     find_copy_problems,
     find_count_problems,
     find_light_problems,
     find_mask_problems,
     find_zoom_problems,
-    header_notes,
 )
 
 
@@ -116,7 +116,7 @@ def _describe(path: Path, report_progress: Progress) -> PhotoSurvey:
     photos = list_photos(folder)
     report_progress(TaskEvent("reading poses", 0.0))
     scene, problems = _load_scene_or_problem(path, folder)
-    posed = _posed_files(scene)
+    posed = _list_posed_files(scene)
     photos = _unite_photos(photos, posed)
     if not photos:
         raise no_photos_error(path, folder)
@@ -125,24 +125,23 @@ def _describe(path: Path, report_progress: Progress) -> PhotoSurvey:
     unreadable |= undecodable
     if not measurements:
         raise unreadable_error(path, unreadable, len(photos))
-    blurred = [
-        measurement.path
-        for measurement, bad in zip(measurements, is_blurred([x.sharpness for x in measurements]), strict=True)
-        if bad
-    ]
-    light = np.log2([max(measurement.exposure.luminance, 1e-6) for measurement in measurements])
-    stops = float(np.ptp(np.quantile(light, (0.05, 0.95))))
+    blurred_mask = is_blurred([measurement.sharpness for measurement in measurements])
+    blurred = [item.path for item, blurred in zip(measurements, blurred_mask, strict=True) if blurred]
+    log_luminances = np.log2([max(measurement.exposure.luminance, 1e-6) for measurement in measurements])
+    stops = float(np.ptp(np.quantile(log_luminances, (0.05, 0.95))))
 
     problems += find_count_problems(len(photos), scene, len(posed), path)
     problems += unreadable_sentences(unreadable, len(photos))
     problems += find_copy_problems(photos, measurements, unreadable, folder, report_progress)
     problems += find_blur_problems(measurements, blurred, folder)
-    problems += find_light_problems(measurements, light, stops, folder, scene)
+    problems += find_light_problems(measurements, log_luminances, stops, folder, scene)
     if scene is None:
         problems += find_zoom_problems(facts) + find_mask_problems(folder, photos)
-    notes = list(scene.notes) if scene is not None else header_notes(facts) + raw_photos_notes(list_raw_photos(folder))
+    notes = (
+        list(scene.notes) if scene is not None else describe_headers(facts) + raw_photos_notes(list_raw_photos(folder))
+    )
     if len(measurements) + len(unreadable) < len(photos):
-        notes.append(f"the pixels of {len(measurements)} of {len(photos)} photos were measured, evenly spaced")
+        notes.append(f"the pixels of {len(measurements)} of {len(photos)} photos, evenly spaced, were measured")
     preset = ": ".join(detect_preset(scene)) if scene is not None and scene.train else ""
     report_progress(TaskEvent("described", 1.0))
     return PhotoSurvey(
@@ -159,7 +158,7 @@ def _describe(path: Path, report_progress: Progress) -> PhotoSurvey:
         sharpness=round(float(np.median([measurement.sharpness for measurement in measurements])), 3),
         blurred=tuple(relative_name(item, folder) for item in blurred),
         stops=round(stops, 2),
-        luminance=round(float(2 ** np.median(light)), 4),
+        luminance=round(float(2 ** np.median(log_luminances)), 4),
         frames=0,
         notes=tuple(notes),
         problems=tuple(problems),
@@ -168,27 +167,27 @@ def _describe(path: Path, report_progress: Progress) -> PhotoSurvey:
 
 def _describe_video(path: Path, report_progress: Progress) -> PhotoSurvey:
     """Describe a video."""
-    found, size, looked = survey_frames(path, progress=report_progress)
+    report, size, measured_count = survey_frames(path, progress=report_progress)
     problems = [f"a video has no poses; {pose_commands(path)}"]
     return PhotoSurvey(
         path=str(path),
         kind="video",
-        photos=found.of,
+        photos=report.of,
         layout="",
         posed=0,
         points=0,
         preset="",
-        sizes={f"{size[0]} x {size[1]}": found.of},
+        sizes={f"{size[0]} x {size[1]}": report.of},
         cameras={},
-        decoded=looked,
+        decoded=measured_count,
         sharpness=0.0,
         blurred=(),
         stops=0.0,
         luminance=0.0,
-        frames=found.taken,
+        frames=report.taken,
         notes=(
-            f"{found.blurred} frames are blurred and {found.repeated} repeated, and would be skipped",
-            *found.notes,
+            f"{report.blurred} frames are blurred and {report.repeated} repeated, and would be skipped",
+            *report.notes,
         ),
         problems=tuple(problems),
     )
@@ -206,7 +205,7 @@ def _load_scene_or_problem(path: Path, folder: Path) -> tuple[Scene | None, list
         return None, [str(error)]
 
 
-def _posed_files(scene: Scene | None) -> set[Path]:
+def _list_posed_files(scene: Scene | None) -> set[Path]:
     """Return the paths of the photos with poses."""
     files = (getattr(view.load, "path", None) for view in scene.views) if scene is not None else ()
     return {Path(file) for file in files if file is not None}

@@ -49,13 +49,13 @@ def read_header_facts(
     """Read the headers of photos; return their facts, and the reason for each photo that cannot be read, by name."""
     facts, unreadable = [], {}
     chosen = evenly_spaced(photos, MAX_OPENED_PHOTOS)
-    for done, photo in enumerate(chosen):
+    for number, photo in enumerate(chosen, start=1):
         try:
             facts.append(read_photo_facts(photo))
         except HyrfDataError as error:
             unreadable[relative_name(photo, folder)] = strip_path(error, display_path(photo))
-        read = f"reading the headers of photos {done + 1}/{len(chosen)}"
-        report_progress(TaskEvent(read, HEADERS_PROGRESS * (done + 1) / len(chosen)))
+        task = f"reading the headers of photos {number}/{len(chosen)}"
+        report_progress(TaskEvent(task, HEADERS_PROGRESS * number / len(chosen)))
     return facts, unreadable
 
 
@@ -66,15 +66,14 @@ def measure_pixels(
     chosen = evenly_spaced(photos, MAX_DECODED_PHOTOS)
     measurements, undecodable = [], {}
     with ThreadPoolExecutor(thread_count()) as pool:
-        for done, found in enumerate(pool.map(_measure_one, chosen)):
-            if isinstance(found, PhotoMeasurement):
-                measurements.append(found)
+        for index, result in enumerate(pool.map(_measure_one, chosen)):
+            if isinstance(result, PhotoMeasurement):
+                measurements.append(result)
             else:
-                undecodable[relative_name(chosen[done], folder)] = found
-            looked = f"measuring photo {done + 1}/{len(chosen)}"
-            report_progress(
-                TaskEvent(looked, HEADERS_PROGRESS + (PIXELS_PROGRESS - HEADERS_PROGRESS) * (done + 1) / len(chosen))
-            )
+                undecodable[relative_name(chosen[index], folder)] = result
+            done = (index + 1) / len(chosen)
+            share = HEADERS_PROGRESS + (PIXELS_PROGRESS - HEADERS_PROGRESS) * done
+            report_progress(TaskEvent(f"measuring photo {index + 1}/{len(chosen)}", share))
     return measurements, undecodable
 
 

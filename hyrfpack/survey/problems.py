@@ -28,9 +28,9 @@ _MIN_SET_LUMINANCE = 0.02  # a set with a lower median of the mean luminances is
 _DARK_PHOTO_STOPS = 3.0  # a photo this far below the median of its set is dark
 _MAX_CLIPPED_PIXEL_RATIO = 0.25
 _SAME_ZOOM_TOLERANCE = 0.03  # EXIF rounds focal lengths by up to this ratio
-# Files of the same size are compared by so many bytes at their start, from their middle on, and at their end. Longer
-# files that agree are compared as a whole, which takes minutes if all photos of a large set are there twice; then
-# further ones count as copies without it.
+# Files of the same size are compared by samples of this many bytes: at their start, from their middle on, and at their
+# end. Longer files whose samples agree are compared as a whole. If a large set has all photos twice, that would take
+# minutes, so it is done for a limited number of photos, and the others count as copies.
 _SAMPLE_BYTES = 1 << 16
 _MAX_HASHED_PHOTOS = 100
 _SAME_PICTURE_MAX_LEVELS = 1.0  # thumbnails of the same picture differ by less, in levels of 255 on average
@@ -38,27 +38,27 @@ _SAME_PICTURE_MAX_LEVELS = 1.0  # thumbnails of the same picture differ by less,
 
 def find_count_problems(count: int, scene: Scene | None, posed: int, path: Path) -> list[str]:
     """Describe too few photos, photos without poses, and missing points."""
-    found = []
+    problems = []
     if count < _MIN_RECOMMENDED_PHOTOS:
-        found.append(
+        problems.append(
             f"there {'is' if count == 1 else 'are'} only {format_count(count, 'photo')}; take "
             f"{_MIN_RECOMMENDED_PHOTOS} or more, from all around and with much overlap"
         )
     if scene is None or scene.layout == "blender":  # only some splits of a Blender set are used
-        return found
-    without = count - posed
-    if posed and without > 0:
+        return problems
+    unposed = count - posed
+    if posed and unposed > 0:
         of_photos = f"of {count} photos"
-        unused = format_count(without, f"{of_photos} has no pose and is", f"{of_photos} have no pose and are")
-        found.append(
+        unused = format_count(unposed, f"{of_photos} has no pose and is", f"{of_photos} have no pose and are")
+        problems.append(
             f"{unused} not used; take more photos between them and the others, or estimate all poses again with "
             f"{suggest_command('poses', path, '-o', 'SCENE')}"
         )
     if not len(scene.points):
-        found.append(
+        problems.append(
             "there are no points, so training has to find surfaces without them; add the points of the reconstruction"
         )
-    return found
+    return problems
 
 
 def find_copy_problems(
@@ -79,14 +79,16 @@ def find_copy_problems(
     by_size = _group_files(readable, lambda photo: photo.stat().st_size)
     middle = (PIXELS_PROGRESS + 1) / 2
 
-    def follow(files: list[Path], start: float, end: float) -> Iterator[Path]:
+    def report_each(files: list[Path], start: float, end: float) -> Iterator[Path]:
         for done, file in enumerate(files):
-            compared = f"searching for identical photos {done + 1}/{len(files)}"
-            report_progress(TaskEvent(compared, start + (end - start) * done / len(files)))
+            task = f"searching for identical photos {done + 1}/{len(files)}"
+            report_progress(TaskEvent(task, start + (end - start) * done / len(files)))
             yield file
 
     by_samples = _group_files(
-        follow([photo for group in by_size.values() if len(group) > 1 for photo in group], PIXELS_PROGRESS, middle),
+        report_each(
+            [photo for group in by_size.values() if len(group) > 1 for photo in group], PIXELS_PROGRESS, middle
+        ),
         lambda photo: (photo.stat().st_size, _digest_samples(photo)),
     )
     to_hash: list[Path] = []
@@ -97,14 +99,14 @@ def find_copy_problems(
             to_hash += group
         else:
             not_hashed.append(group)
-    hashed = _group_files(follow(to_hash, middle, 1.0), lambda photo: hashlib.sha256(photo.read_bytes()).digest())
+    hashed = _group_files(report_each(to_hash, middle, 1.0), lambda photo: hashlib.sha256(photo.read_bytes()).digest())
     copies = [(photo, first) for first, *others in [*hashed.values(), *not_hashed] for photo in others]
     if not copies:
         return []
     first, of = (relative_name(item, folder) for item in copies[0])
     return [
-        f"{format_count(len(copies), 'photo is', 'photos are')} a copy of another (such as {first} of {of}); "
-        "remove the copies"
+        f"{format_count(len(copies), 'photo is a copy of another', 'photos are copies of others')} (such as {first} of "
+        f"{of}); remove the copies"
     ]
 
 
@@ -121,8 +123,8 @@ def _digest_samples(file: Path) -> bytes:
     """Return a digest of samples of a file: its start, its middle and its end; of a short file, all of its bytes."""
     size, digest = file.stat().st_size, hashlib.sha256()
     with file.open("rb") as opened:
-        for place in (0, (size - _SAMPLE_BYTES) // 2, size - _SAMPLE_BYTES):
-            opened.seek(max(0, place))
+        for offset in (0, (size - _SAMPLE_BYTES) // 2, size - _SAMPLE_BYTES):
+            opened.seek(max(0, offset))
             digest.update(opened.read(_SAMPLE_BYTES))
     return digest.digest()
 
@@ -144,22 +146,22 @@ def find_blur_problems(measurements: list[PhotoMeasurement], blurred: list[Path]
 
 
 def find_light_problems(
-    measurements: list[PhotoMeasurement], light: np.ndarray, stops: float, folder: Path, scene: Scene | None
+    measurements: list[PhotoMeasurement], log_luminances: np.ndarray, stops: float, folder: Path, scene: Scene | None
 ) -> list[str]:
     """Describe dark, clipped or unevenly exposed photos."""
     if scene is not None and scene.has_alpha:
         return []  # transparent pixels are not dark
-    found = []
-    middle = float(np.median(light))
-    if 2**middle < _MIN_SET_LUMINANCE:
-        found.append("the photos are dark; take them in more light, or with a longer exposure and a tripod")
+    problems = []
+    median = float(np.median(log_luminances))
+    if 2**median < _MIN_SET_LUMINANCE:
+        problems.append("the photos are dark; take them in more light, or with a longer exposure and a tripod")
     dark = [
         relative_name(measurement.path, folder)
-        for measurement, value in zip(measurements, light, strict=True)
-        if value < middle - _DARK_PHOTO_STOPS
+        for measurement, value in zip(measurements, log_luminances, strict=True)
+        if value < median - _DARK_PHOTO_STOPS
     ]
     if dark:
-        found.append(
+        problems.append(
             f"{format_count(len(dark), 'photo is', 'photos are')} over {_DARK_PHOTO_STOPS:g} stops darker than "
             f"the others ({format_file_names(dark)}); leave out dark photos"
         )
@@ -169,15 +171,15 @@ def find_light_problems(
         if measurement.exposure.bright > _MAX_CLIPPED_PIXEL_RATIO
     ]
     if len(bright) > len(measurements) / 4:
-        found.append(
+        problems.append(
             f"{format_count(len(bright), 'photo is', 'photos are')} overexposed in a quarter or more of the "
             f"pixels ({format_file_names(bright)}); reduce the exposure, and lock it"
         )
     if stops > _MAX_EXPOSURE_SPREAD_STOPS:
-        found.append(
+        problems.append(
             f"the photos differ by {stops:.1f} stops in brightness; lock exposure and white balance while you take them"
         )
-    return found
+    return problems
 
 
 def find_zoom_problems(facts: list[PhotoFacts]) -> list[str]:
@@ -189,12 +191,12 @@ def find_zoom_problems(facts: list[PhotoFacts]) -> list[str]:
             relative = fact.focal / max(fact.size)
             if not any(abs(relative / other - 1) < _SAME_ZOOM_TOLERANCE for other in known):
                 known.add(relative)
-    most = max((len(values) for values in lengths.values()), default=0)
-    if most < 2:
+    count = max((len(values) for values in lengths.values()), default=0)
+    if count < 2:
         return []
     device = max(lengths, key=lambda name: len(lengths[name]))
     return [
-        f"the photos have {most} different focal lengths{f' ({device})' if device else ''}; each gets its own "
+        f"the photos have {count} different focal lengths{f' ({device})' if device else ''}; each gets its own "
         "intrinsics, but poses are less reliable; use one lens, and do not zoom"
     ]
 
@@ -202,24 +204,25 @@ def find_zoom_problems(facts: list[PhotoFacts]) -> list[str]:
 def find_mask_problems(folder: Path, photos: list[Path]) -> list[str]:
     """Describe masks whose names match no photo; for photos with poses, `load_scene` reports them."""
     masks = next((folder / name for name in ("masks", "mask") if (folder / name).is_dir()), None)
-    there = [] if masks is None else [file for file in masks.rglob("*") if file.suffix.lower() in PICTURE_SUFFIXES]
+    mask_files = [] if masks is None else [file for file in masks.rglob("*") if file.suffix.lower() in PICTURE_SUFFIXES]
     names = {photo.stem for photo in photos} | {photo.name for photo in photos}
-    stray = sorted(file.name for file in there if file.stem not in names)
-    if not stray:
+    unmatched = sorted(file.name for file in mask_files if file.stem not in names)
+    if not unmatched:
         return []
+    of_masks = f"of {len(mask_files)} masks"
     return [
-        f"{format_count(len(stray), f'of {len(there)} masks matches', f'of {len(there)} masks match')} no photo "
-        f"({format_file_names(stray)}); give each the name of its photo"
+        f"{format_count(len(unmatched), f'{of_masks} matches', f'{of_masks} match')} no photo "
+        f"({format_file_names(unmatched)}); give each the name of its photo"
     ]
 
 
-def header_notes(facts: list[PhotoFacts]) -> list[str]:
-    """Describe rotated, large and panoramic photos."""
+def describe_headers(facts: list[PhotoFacts]) -> list[str]:
+    """Return notes about rotated, large and panoramic photos."""
     notes = []
-    turned = sum(fact.orientation != 1 for fact in facts)
-    if turned:
+    rotated = sum(fact.orientation != 1 for fact in facts)
+    if rotated:
         notes.append(
-            f"{format_count(turned, 'photo is', 'photos are')} stored rotated; 'hyrfpack poses' makes upright copies"
+            f"{format_count(rotated, 'photo is', 'photos are')} stored rotated; 'hyrfpack poses' makes upright copies"
         )
     large = sum(max(fact.size) > DEFAULT_MAX_SIZE for fact in facts)
     if large:
@@ -227,9 +230,9 @@ def header_notes(facts: list[PhotoFacts]) -> list[str]:
             f"{format_count(large, f'of {len(facts)} photos is', f'of {len(facts)} photos are')} larger than "
             f"{DEFAULT_MAX_SIZE:,} pixels and shrunk to that for training; `max_size` sets another limit"
         )
-    round_ = sum(fact.size[0] == 2 * fact.size[1] for fact in facts)
-    if round_:
+    wide = sum(fact.size[0] == 2 * fact.size[1] for fact in facts)
+    if wide:
         notes.append(
-            f"{format_count(round_, 'photo is', 'photos are')} twice as wide as high, like those of 360-degree cameras"
+            f"{format_count(wide, 'photo is', 'photos are')} twice as wide as high, like those of 360-degree cameras"
         )
     return notes

@@ -13,7 +13,7 @@ from hyrfpack.data.cache import PictureCache
 from hyrfpack.data.reduced import reduce_camera, reduce_picture
 from hyrfpack.parallel import has_numba
 from hyrfpack.scene import Camera, Picture, Scene, View, evenly_spaced
-from hyrfpack.stereo import InverseDepthMap, Photo, count_agreeing, estimate_depth_maps
+from hyrfpack.stereo import InverseDepthMap, StereoPhoto, count_agreeing_sources, estimate_depth_maps
 
 MAX_PHOTOS = 100  # More photos are not read: they show the same surfaces.
 # Without tracks, points only say which photos show the same place, and how near surfaces can be.
@@ -93,7 +93,7 @@ def _reduction(camera: Camera) -> int:
     return min(-(-longer // MAX_DEPTH_MAP_SIDE_PIXELS), shorter)
 
 
-def _reduced_photo(camera: Camera, picture: Picture, shown: np.ndarray) -> Photo:
+def _reduced_photo(camera: Camera, picture: Picture, shown: np.ndarray) -> StereoPhoto:
     """Reduce a photo to the size at which its depths are estimated; transparent pixels become black.
 
     A pixel is usable if none of the photo's pixels in it is masked or transparent.
@@ -109,10 +109,10 @@ def _reduced_photo(camera: Camera, picture: Picture, shown: np.ndarray) -> Photo
     grey = reduced.rgb.mean(-1, dtype=np.float32) / np.float32(255)
     if reduced.alpha is not None:
         grey *= reduced.alpha / np.float32(255)
-    return Photo(reduce_camera(camera, factor), grey, reduced.mask, shown)
+    return StereoPhoto(reduce_camera(camera, factor), grey, reduced.mask, shown)
 
 
-def _agreed_inverse_depths(maps: Sequence[InverseDepthMap | None], index: int, photo: Photo) -> np.ndarray:
+def _agreed_inverse_depths(maps: Sequence[InverseDepthMap | None], index: int, photo: StereoPhoto) -> np.ndarray:
     """Return the inverse depths (H, W) of a depth map, 0 where too few photos agree.
 
     Depths beyond the last plane before infinity are 0 as well: the background sphere shows them.
@@ -121,7 +121,7 @@ def _agreed_inverse_depths(maps: Sequence[InverseDepthMap | None], index: int, p
     if depth_map is None:
         return np.zeros(photo.grey.shape)
     is_near = depth_map.inverse_depths > depth_map.spacing
-    return np.where(is_near & (count_agreeing(maps, index) >= MIN_AGREEING_PHOTOS), depth_map.inverse_depths, 0)
+    return np.where(is_near & (count_agreeing_sources(maps, index) >= MIN_AGREEING_PHOTOS), depth_map.inverse_depths, 0)
 
 
 def _interpolated(camera: Camera, points: np.ndarray) -> np.ndarray:

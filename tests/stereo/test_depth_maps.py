@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from textured_planes import camera_at, depths_of_planes, photograph
 
-from hyrfpack.stereo import Photo, count_agreeing, estimate_depth_maps
+from hyrfpack.stereo import StereoPhoto, count_agreeing_sources, estimate_depth_maps
 from hyrfpack.stereo.depth_maps import PLANE_COUNT
 from hyrfpack.stereo.sources import MAX_SOURCES, choose_sources
 from hyrfpack.train.surface_depths import MIN_AGREEING_PHOTOS
@@ -28,7 +28,7 @@ def points_on(planes, camera=PLANE_CAMERAS[0], count: int = 60) -> np.ndarray:
     return camera.unproject(column + 0.5, row + 0.5, depth[row, column])
 
 
-def photos_of(planes) -> tuple[list[Photo], np.ndarray]:
+def photos_of(planes) -> tuple[list[StereoPhoto], np.ndarray]:
     points = points_on(planes)
     return [photograph(camera, planes, points) for camera in PLANE_CAMERAS], points
 
@@ -47,7 +47,7 @@ def test_depths_are_those_of_the_planes_in_any_unit(planes, unit, agreeing):
         pose[:3, 3] *= unit
         scaled.append(dataclasses.replace(photo, camera=dataclasses.replace(photo.camera, camera_from_world=pose)))
     maps = estimate_depth_maps(scaled, unit * points)
-    agreed = count_agreeing(maps, 0) >= agreeing
+    agreed = count_agreeing_sources(maps, 0) >= agreeing
     errors = np.abs(maps[0].inverse_depths - 1 / (unit * truth)) / maps[0].spacing
     assert agreed.mean() > 0.75
     assert np.quantile(errors[agreed], 0.9) < 1 and np.median(errors[agreed]) < 0.4
@@ -65,7 +65,7 @@ def test_fewer_photos_agree_about_an_object_that_moves():
     planes = [[WALL_PLANE, (2.5, 0.0, -0.4 + shift, 0.4 + shift)] for shift in (0.0, 0.9, -0.9, 0.9, -0.9)]
     points = points_on([WALL_PLANE])
     photos = [photograph(camera, shown, points) for camera, shown in zip(PLANE_CAMERAS, planes, strict=True)]
-    agreed = count_agreeing(estimate_depth_maps(photos, points), 0) >= 2
+    agreed = count_agreeing_sources(estimate_depth_maps(photos, points), 0) >= 2
     depth, _ = depths_of_planes(PLANE_CAMERAS[0], planes[0])
     board = np.zeros_like(agreed)
     board[4:-4, 4:-4] = (depth < 3)[4:-4, 4:-4]
@@ -84,7 +84,7 @@ def test_photos_that_share_no_points_have_no_depth_map():
     photos[0] = dataclasses.replace(photos[0], points=np.zeros(0, np.int64))
     maps = estimate_depth_maps(photos, points)
     assert maps[0] is None and all(found is not None for found in maps[1:])
-    assert count_agreeing(maps, 1).max() <= MAX_SOURCES - 1
+    assert count_agreeing_sources(maps, 1).max() <= MAX_SOURCES - 1
     assert estimate_depth_maps(photos[:1], points) == [None]
     assert estimate_depth_maps([], points) == []
 
@@ -93,7 +93,9 @@ def test_depth_maps_are_finite_and_within_their_planes():
     generator = np.random.default_rng(0)
     _, points = photos_of([WALL_PLANE])
     usable, everything = np.ones((48, 64), bool), np.arange(len(points))
-    photos = [Photo(camera, generator.random((48, 64), np.float32), usable, everything) for camera in PLANE_CAMERAS]
+    photos = [
+        StereoPhoto(camera, generator.random((48, 64), np.float32), usable, everything) for camera in PLANE_CAMERAS
+    ]
     for depth_map in estimate_depth_maps(photos, points):
         assert depth_map.inverse_depths.dtype == np.float64 and np.isfinite(depth_map.inverse_depths).all()
         assert depth_map.inverse_depths.min() >= 0 and depth_map.inverse_depths.max() <= PLANE_COUNT * depth_map.spacing
@@ -113,8 +115,8 @@ def test_sources_share_points_and_see_them_from_about_five_degrees():
 def test_unusable_pixels_confirm_no_depth():
     photos, points = photos_of([WALL_PLANE])
     masked = [dataclasses.replace(photo, usable=np.zeros_like(photo.usable)) for photo in photos[1:]]
-    assert count_agreeing(estimate_depth_maps(photos, points), 0).max() > 0
-    assert count_agreeing(estimate_depth_maps([photos[0], *masked], points), 0).max() == 0
+    assert count_agreeing_sources(estimate_depth_maps(photos, points), 0).max() > 0
+    assert count_agreeing_sources(estimate_depth_maps([photos[0], *masked], points), 0).max() == 0
 
 
 @pytest.mark.parametrize("depth", [1e-300, 1e-30])
@@ -126,7 +128,7 @@ def test_points_in_a_camera_do_no_harm(depth):
     assert any(maps)
     for index, depth_map in enumerate(maps):
         if depth_map is not None:
-            assert np.isfinite(depth_map.inverse_depths).all() and count_agreeing(maps, index).shape == (48, 64)
+            assert np.isfinite(depth_map.inverse_depths).all() and count_agreeing_sources(maps, index).shape == (48, 64)
 
 
 @pytest.mark.parametrize("depth", [1e30, 1e100])

@@ -114,7 +114,7 @@ def test_of_large_sets_few_photos_are_read_whole_to_find_copies(photos, monkeypa
     monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path.name) or read_bytes(path))
     monkeypatch.setattr("hyrfpack.survey.problems._MAX_HASHED_PHOTOS", 5)
     monkeypatch.setattr("hyrfpack.survey.problems._SAMPLE_BYTES", 64)
-    assert "3 photos are a copy" in find_problem(describe_photos(photos), "3 photos are a copy")
+    assert "3 photos are copies of others" in find_problem(describe_photos(photos), "3 photos are copies")
     assert read == ["001 (1).jpg", "001.jpg", "002 (1).jpg", "002.jpg"]
 
 
