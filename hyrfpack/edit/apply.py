@@ -1,4 +1,4 @@
-"""Apply actions to a scene in turn."""
+"""Apply actions to a scene, one after the other."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hyrfpack.cameras.capture import (
 from hyrfpack.cameras.paths import estimate_up
 from hyrfpack.cameras.placement import Placement, unit_vector
 from hyrfpack.config.edit import Action, Background, Center, Crop, EstimateUp, Move, Refit, Remove, Up, Upright
-from hyrfpack.edit.refit import refit, score_region
+from hyrfpack.edit.refit import refit_region, score_region
 from hyrfpack.edit.report import ActionReport
 from hyrfpack.edit.select import keep_mask
 from hyrfpack.edit.state import EditState
@@ -63,13 +63,13 @@ class EditedPart:
 
     @property
     def keeps_gaussians(self) -> bool:
-        """Return whether all numbers of the Gaussians are as before."""
+        """Return whether no number of the Gaussians has changed."""
         before, after = (model.gaussians.parameters() for model in (self.before, self.after))
         return all(torch.equal(old, new) for old, new in zip(before, after, strict=True))
 
     @property
-    def keeps_looks(self) -> bool:
-        """Return whether the model renders as before, but for its place in the world."""
+    def keeps_appearance(self) -> bool:
+        """Return whether the model renders as before, apart from its place in the world."""
         before, after = self.before.config, self.after.config
         keeps_background = before.background == after.background and before.solid == after.solid
         return keeps_background and self.keeps_gaussians
@@ -109,7 +109,7 @@ class Edit:
 
 
 def open_scene(path: Path, source: Path, data: Scene | None, progress: Progress) -> Edit:
-    """Read the scene of a file, to which no action has been applied.
+    """Read the scene of a file as an edit without actions.
 
     Args:
         path: a file of one model, or a merged file.
@@ -172,7 +172,7 @@ def apply_actions(edit: Edit, actions: Sequence[Action]) -> Edit:
         part, placement = sources[name], state.placement
         provenance = part.provenance if placement.is_identity else move_provenance(placement, part.provenance)
         edited = replace(part, after=after, provenance=provenance)
-        if "psnr" in provenance and not edited.keeps_looks:
+        if "psnr" in provenance and not edited.keeps_appearance:
             edited = replace(edited, provenance={**provenance, PSNR_BEFORE_KEY: PSNR_BEFORE_EDIT})
         parts.append(edited)
     if state.has_chosen_up:
@@ -184,7 +184,7 @@ def apply_actions(edit: Edit, actions: Sequence[Action]) -> Edit:
 
 
 def _apply_action(action: Action, state: EditState) -> tuple[EditState, ActionReport]:
-    """Apply one action; return the scene after it, and what was done."""
+    """Apply one action; return the scene after the action, and the report about the action."""
     count = len(state.model)
     report = ActionReport(str(action), count, count)
     if isinstance(action, EstimateUp):
@@ -200,7 +200,7 @@ def _apply_action(action: Action, state: EditState) -> tuple[EditState, ActionRe
         return replace(state, model=map_parts(changed, state.model)), report
     if isinstance(action, Refit):
         return _refit(action, state, report)
-    if (step := _find_move(action, state)) is not None:
+    if (step := _action_placement(action, state)) is not None:
         return state.move(step), report
     keep = keep_mask(action, state)
     if not keep.any():
@@ -208,28 +208,28 @@ def _apply_action(action: Action, state: EditState) -> tuple[EditState, ActionRe
         low, high = (corner.round(4).tolist() for corner in (positions.min(axis=0), positions.max(axis=0)))
         where = f"; all centres lie between {low} and {high}" if isinstance(action, Crop | Remove) else ""
         raise HyrfError(f"'{action}' would remove every Gaussian{where}", fix="choose another region or limit")
-    after = _keep(keep, state)
+    after = _keep_gaussians(keep, state)
     return after, replace(report, gaussians_after=len(after.model))
 
 
-def _keep(keep: np.ndarray, state: EditState) -> EditState:
-    """Return the scene of the Gaussians in a mask (N,). Parts of a merged file that are left with none are left out."""
+def _keep_gaussians(keep: np.ndarray, state: EditState) -> EditState:
+    """Return the scene with only the Gaussians in a mask (N,). Parts of a merged file without any are left out."""
     kept = map_parts(
         lambda part: part.requires_grad_(False), state.model.subset(torch.from_numpy(np.flatnonzero(keep)))
     )
     if not isinstance(kept, MergedModel):
         return replace(state, model=kept)
-    whole = kept.without_empty_parts()
+    remaining = kept.without_empty_parts()
     for name in kept.names:
-        if name not in whole.names:
-            _LOG.info(f"part '{name}' has no Gaussian left, and is left out")
-    if whole.names[0] == kept.names[0]:
-        return replace(state, model=whole)
-    _LOG.info(f"the background, the viewpoint and the cameras of the file are those of part '{whole.names[0]}' now")
-    capture, placement = state.captures[whole.names[0]], state.placement
+        if name not in remaining.names:
+            _LOG.info(f"part '{name}' has no Gaussian left and is left out")
+    if remaining.names[0] == kept.names[0]:
+        return replace(state, model=remaining)
+    _LOG.info(f"the file now has the background, the viewpoint and the cameras of part '{remaining.names[0]}'")
+    capture, placement = state.captures[remaining.names[0]], state.placement
     return replace(
         state,
-        model=whole,
+        model=remaining,
         cameras=[placement.move_camera(camera) for camera in capture.cameras],
         center=placement.move_point(capture.viewpoint.center),
         up=state.up if state.has_chosen_up else placement.move_direction(capture.viewpoint.up),
@@ -238,18 +238,20 @@ def _keep(keep: np.ndarray, state: EditState) -> EditState:
 
 
 def _refit(action: Refit, state: EditState, report: ActionReport) -> tuple[EditState, ActionReport]:
-    """Train the Gaussians of a region; return the scene after it, and the scores of the region on held-out photos."""
+    """Train the Gaussians of a region; return the scene after the training, and the completed report."""
     if isinstance(state.model, MergedModel):
         raise HyrfError(
-            "photos show one model, and this file holds several, so it cannot be trained on them",
+            "a region of a merged file cannot be trained, because photos show only one of its models",
             fix="take the part out with `part`, train its region, and merge again",
         )
     if not state.photos:
-        raise HyrfError("a region is trained on photos, and there are none", fix="name the photos with `data`")
+        raise HyrfError("a region is trained on photos, but no photos are given", fix="name the photos with `data`")
     is_selected = keep_mask(action.region, state)
     if not is_selected.any():
-        raise HyrfError(f"'{action}' trains nothing, as no Gaussian lies there", fix="change its region")
-    model = refit(
+        raise HyrfError(
+            f"'{action}' would train nothing, because its region holds no Gaussian", fix="change the region"
+        )
+    model = refit_region(
         state.model, is_selected, state.photos, action.steps, has_gains=state.has_gains, progress=state.progress
     )
     scores = score_region((state.model, model), is_selected, state.held_out)
@@ -259,8 +261,8 @@ def _refit(action: Refit, state: EditState, report: ActionReport) -> tuple[EditS
     return replace(state, model=model), report
 
 
-def _find_move(action: Action, state: EditState) -> Placement | None:
-    """Return the map of world positions that an action applies, None if it moves nothing."""
+def _action_placement(action: Action, state: EditState) -> Placement | None:
+    """Return the map of world positions that an action applies; None if the action moves nothing."""
     if isinstance(action, Move):
         return placement_of(action)
     if isinstance(action, Upright):

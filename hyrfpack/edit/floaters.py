@@ -3,7 +3,7 @@
 First only the opacities are fitted to the photos, and they may only fall, because otherwise one surface could replace
 another. A pixel's colour is linear in each opacity, so Gaussians that the photos contradict fade. The loss charges for
 light that is lost, so a Gaussian with the colour of what lies behind it keeps its opacity. Of the faded Gaussians,
-those in front of the depth of the others are floaters. The rest are superfluous parts of surfaces and stay.
+those in front of the surface that the others show are floaters. The rest are superfluous parts of surfaces and stay.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from hyrfpack.train.resolution import reduced_low_pass_variance
 
 MAX_PHOTOS = 128
 MAX_REDUCED_SIDE_PIXELS = 640
-# Each photo is used at least this often, and there are at least so many steps of one photo each.
-MIN_PASSES, MIN_STEPS = 16, 600
+# Opacities are fitted in steps of one photo each: at least this many passes over all photos, and this many steps.
+MIN_FADING_PASSES, MIN_FADING_STEPS = 16, 600
 # Learning rates of the shares of opacity, at the first step and after the last one.
 LEARNING_RATES = (0.1, 0.005)
 ADAM_BETAS = (0.9, 0.99)
 # Fading must lower the squared error, the mean of three channels, by this much for each pixel of light that is lost.
 MIN_ERROR_PER_LIGHT = (4.5 / 255) ** 2
-# A floater is nearer than the surface behind it by this fraction of the surface's depth, in this share of its views.
-MIN_GAP = 0.12
+# A floater is nearer than the surface behind it by this ratio of the surface's depth, in this share of its views.
+MIN_GAP_DEPTH_RATIO = 0.12
 MIN_VIEW_SHARE_IN_FRONT = 0.15
-# Many faded Gaussians, each with a share of 0.01, are a haze that others then make up for.
-MIN_SHARE = 0.002
+# With a minimum of 0.01, many faded Gaussians would still be a haze, and others would change to compensate for it.
+MIN_SUPPORTED_SHARE = 0.002
 MIN_OPACITY, MAX_OPACITY = 1e-4, 1 - 1e-4  # limits for finite logits
-MIN_SURFACE_ALPHA = 0.5  # pixels with less coverage show no surface: what is there lies in front of it
-_FADING_PROGRESS_SHARE = 0.9
+MIN_SURFACE_ALPHA = 0.5  # pixels with less coverage show no surface, so every Gaussian lies in front of it
+_FADING_PROGRESS_SHARE = 0.9  # comparing depths takes the rest of the time
 
 
 def find_floaters(
@@ -66,43 +66,43 @@ def find_floaters(
     factor = math.ceil(longest / MAX_REDUCED_SIDE_PIXELS)
     settings = RenderSettings(low_pass_variance=reduced_low_pass_variance(factor))
     reduced = [reduce_view(view, factor) for view in evenly_spaced(views, MAX_PHOTOS)]
-    faded = _supported_shares(model, reduced, settings, progress) < min_opacity_share
+    faded = _fit_supported_shares(model, reduced, settings, progress) < min_opacity_share
     if not faded.any():
         return faded
     progress(TaskEvent("comparing depths", _FADING_PROGRESS_SHARE))
     others = model.subset(torch.from_numpy(np.flatnonzero(~faded))).requires_grad_(False)
     positions = model.config.frame.to_world(model.gaussians.positions.detach().numpy()[faded])
     cameras = [view.camera for view in reduced]
-    faded[faded] = _share_in_front(positions, others, cameras, settings) > MIN_VIEW_SHARE_IN_FRONT
+    faded[faded] = _share_of_views_in_front(positions, others, cameras, settings) > MIN_VIEW_SHARE_IN_FRONT
     return faded
 
 
-def _supported_shares(
+def _fit_supported_shares(
     model: HybridModel, views: Sequence[View], settings: RenderSettings, progress: Progress
 ) -> np.ndarray:
-    """Return the share (N,) of its opacity that the photos leave to each Gaussian, `MIN_SHARE` to 1.
+    """Fit the share (N,) of its opacity that the photos leave to each Gaussian, `MIN_SUPPORTED_SHARE` to 1.
 
     The shares s minimise the squared error of the photos plus the cost of lost light: `MIN_ERROR_PER_LIGHT` (1 - s) L
     for a Gaussian with the light L, in pixels of a mean view. A logit instead of a share would leave opaque Gaussians
     almost no gradient.
     """
-    reduced = copy.deepcopy(model).requires_grad_(False)
+    faded = copy.deepcopy(model).requires_grad_(False)
     before = model.decode_geometry().opacities.detach()[:, None].clamp(MIN_OPACITY, MAX_OPACITY)
-    fields = logit(before) - reduced.gaussians.opacity_logits
-    del reduced.gaussians.opacity_logits  # from a parameter to a function of the shares
+    field_logits = logit(before) - faded.gaussians.opacity_logits
+    del faded.gaussians.opacity_logits  # the logits become a function of the shares instead of a parameter
     light = _mean_light(model, views, settings)
     shares = torch.ones_like(before).requires_grad_(True)
     optimizer = torch.optim.Adam([shares], betas=ADAM_BETAS)
     solid = np.array(model.config.solid, np.float32)
-    order = np.random.default_rng(0)
-    passes = max(MIN_PASSES, math.ceil(MIN_STEPS / len(views)))
+    rng = np.random.default_rng(0)
+    passes = max(MIN_FADING_PASSES, math.ceil(MIN_FADING_STEPS / len(views)))
     steps = passes * len(views)
-    shuffled = (views[i] for _ in range(passes) for i in order.permutation(len(views)))
+    shuffled = (views[i] for _ in range(passes) for i in rng.permutation(len(views)))
     for step, (view, picture) in enumerate(PictureCache().stream(shuffled)):
         progress(TaskEvent("comparing with photos", _FADING_PROGRESS_SHARE * step / steps))
         photo, mask = upload(picture, solid, shares.device)
-        reduced.gaussians.opacity_logits = logit(shares * before) - fields
-        rgb = render_view(reduced, view.camera, settings).rgb
+        faded.gaussians.opacity_logits = logit(shares * before) - field_logits
+        rgb = render_view(faded, view.camera, settings).rgb
         if not rgb.requires_grad:  # no Gaussian is in view
             continue
         kept_light = (light * shares).sum() / photo[..., 0].numel()
@@ -111,7 +111,7 @@ def _supported_shares(
         optimizer.param_groups[0]["lr"] = np.interp(step, (0, steps), LEARNING_RATES)
         optimizer.step()
         with torch.no_grad():
-            shares.clamp_(MIN_SHARE, 1)
+            shares.clamp_(MIN_SUPPORTED_SHARE, 1)
     return shares.detach()[:, 0].numpy()
 
 
@@ -131,7 +131,7 @@ def _mean_light(model: HybridModel, views: Sequence[View], settings: RenderSetti
 def _squared_error(rgb: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
     """Return the mean squared error of a render (H, W, 3), after its channels are scaled to the exposure of the photo.
 
-    Without this, opacities would change to make pictures brighter or darker.
+    Without the scaling, opacities would change to make pictures brighter or darker.
     """
     weight = rgb.new_ones(()) if mask is None else mask[..., None].to(rgb)
     with torch.no_grad():
@@ -139,7 +139,7 @@ def _squared_error(rgb: Tensor, photo: Tensor, mask: Tensor | None) -> Tensor:
     return (weight * (gains * rgb - photo).square()).mean()
 
 
-def _share_in_front(
+def _share_of_views_in_front(
     positions: np.ndarray, others: HybridModel, cameras: Sequence[Camera], settings: RenderSettings
 ) -> np.ndarray:
     """Return the share (n,) of views in which points lie clearly in front of the surface that other Gaussians show.
@@ -152,7 +152,7 @@ def _share_in_front(
         cameras: cameras of the views.
         settings: settings of the renders.
     """
-    in_front, seen = np.zeros(len(positions)), np.zeros(len(positions))
+    in_front_count, visible_count = np.zeros(len(positions)), np.zeros(len(positions))
     for camera in cameras:
         with torch.no_grad():
             rendering = render_view(others, camera, replace(settings, transmittance_min=0), depth=True)
@@ -161,6 +161,6 @@ def _share_in_front(
         x, y, z = camera.project(positions)
         inside = np.flatnonzero(camera.in_picture(x, y, z))
         depths, behind = z[inside], surface[y[inside].astype(np.int64), x[inside].astype(np.int64)]
-        in_front[inside] += depths < (1 - MIN_GAP) * behind
-        seen[inside] += depths < (1 + MIN_GAP) * behind
-    return in_front / np.maximum(seen, 1)
+        in_front_count[inside] += depths < (1 - MIN_GAP_DEPTH_RATIO) * behind
+        visible_count[inside] += depths < (1 + MIN_GAP_DEPTH_RATIO) * behind
+    return in_front_count / np.maximum(visible_count, 1)

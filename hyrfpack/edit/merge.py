@@ -1,4 +1,4 @@
-"""Merge models into one file, and take parts out again."""
+"""Merge models into one file, and extract parts of a merged file."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def merge_models(
 
     Raises:
         HyrfError: a file cannot be read or written, `moves` names no source or two, there are too many parts, a
-            model without Gaussians, or some models are antialiased and others not.
+            model has no Gaussians, or some models are antialiased and others not.
         TypeError: an action of `moves` is no move.
         ValueError: there is no source.
 
@@ -97,15 +97,34 @@ def merge_models(
     stems = [name_model(source) for source in sources]
     placements = _check_moves(stems, moves or {})
     Outputs(*paths, overwrite=overwrite).file(target, ".hyrf")
+    parts = _read_parts(paths, stems, placements)
+    written = write_parts([(part.name, data) for part, data in parts], target, overwrite=overwrite)
+    return MergeReport(written.file, written.bytes_after, [part for part, _ in parts])
+
+
+def _read_parts(
+    paths: Sequence[Path], stems: Sequence[str], placements: Mapping[str, Placement]
+) -> list[tuple[MergedPart, bytes]]:
+    """Return the parts of a merged file with their bytes, in order.
+
+    Args:
+        paths: files of the sources.
+        stems: names of the sources, from which their parts get their names.
+        placements: placements of moved sources, by name.
+
+    Raises:
+        HyrfError: a file cannot be read, there are too many parts, a model is empty, or some models are antialiased and
+            others not.
+    """
     parts: list[tuple[MergedPart, bytes]] = []
-    antialiased: dict[bool, str] = {}
+    antialiased: dict[bool, str] = {}  # the last file with and without antialiasing
     for path, stem in zip(paths, stems, strict=True):
         with Container.open(path, SECTION_CONTENTS) as container:
             is_merged = PART_NAMES in container.entries
             for name, part in open_parts(container) if is_merged else [(stem, container)]:
                 if len(parts) == MAX_PARTS:
                     raise HyrfError(
-                        f"{path}: with it there are more than {MAX_PARTS} parts, which a file cannot hold",
+                        f"{path}: with this model there are more than {MAX_PARTS} parts, which a file cannot hold",
                         fix="merge fewer models",
                     )
                 count = read_metadata(part).gaussians
@@ -113,7 +132,7 @@ def merge_models(
                     place = f"{path}: part '{name}'" if is_merged else path
                     raise HyrfError(f"{place}: there is no Gaussian in it to merge", fix="leave it out")
                 antialiased[read_config(part).antialiased] = str(path)
-                data = _moved_bytes(part, placements[stem]) if stem in placements else self_contained_bytes(part)
+                data = _move_bytes(part, placements[stem]) if stem in placements else self_contained_bytes(part)
                 taken = {other.name for other, _ in parts}
                 merged = MergedPart(_free_name(name, taken), str(path), count, len(data))
                 parts.append((merged, data))
@@ -122,12 +141,11 @@ def merge_models(
             f"{antialiased[True]} is antialiased and {antialiased[False]} is not, so one picture cannot show both",
             fix="train both with the same `antialiased`",
         )
-    written = write_parts([(part.name, data) for part, data in parts], target, overwrite=overwrite)
-    return MergeReport(written.file, written.bytes_after, [part for part, _ in parts])
+    return parts
 
 
-def take_part(path: Path, part: str | None, folder: StrPath) -> Path:
-    """Return `path` itself if `part` is None, or the path of a copy in `folder` of a part of a merged file.
+def extract_part(path: Path, part: str | None, folder: StrPath) -> Path:
+    """Copy a part of a merged file into a folder and return the path of the copy; without `part`, return `path` itself.
 
     Raises:
         HyrfError: the file is damaged, or there is no such part.
@@ -137,10 +155,13 @@ def take_part(path: Path, part: str | None, folder: StrPath) -> Path:
     with Container.open(path, SECTION_CONTENTS) as container:
         parts = dict(open_parts(container)) if PART_NAMES in container.entries else {}
         if not parts:
-            raise HyrfError(f"{path}: it holds one model and no parts", fix="leave out `part`")
+            raise HyrfError(f"{path}: this file holds one model and no parts", fix="leave out `part`")
         if part not in parts:
             names = ", ".join(f"'{name}'" for name in parts)
-            raise HyrfError(f"{path}: it holds the parts {names}", fix="name one of them with `part`")
+            raise HyrfError(
+                f"{path}: there is no part '{part}'; the file holds the parts {names}",
+                fix="name one of them with `part`",
+            )
         copy = Path(folder, "part.hyrf")
         write_atomic(copy, parts[part].read_bytes())
         return copy
@@ -151,9 +172,9 @@ def _check_moves(stems: Sequence[str], moves: Mapping[str, Sequence[Move]]) -> d
     placements = {}
     for name, actions in moves.items():
         if stems.count(name) != 1:
-            found = "none" if name not in stems else "several"
+            matching = "none" if name not in stems else "more than one"
             raise HyrfError(
-                f"a move names the model '{name}', and {found} of the models {', '.join(stems)} has this name",
+                f"a move names the model '{name}', but {matching} of the models {', '.join(stems)} has this name",
                 fix="name a file without its folder and ending; rename a file if two have the same name",
             )
         placement = Placement()
@@ -163,7 +184,7 @@ def _check_moves(stems: Sequence[str], moves: Mapping[str, Sequence[Move]]) -> d
     return placements
 
 
-def _moved_bytes(part: Container, placement: Placement) -> bytes:
+def _move_bytes(part: Container, placement: Placement) -> bytes:
     """Return the bytes of a model that is placed elsewhere; only its metadata differ."""
     config = read_config(part)
     moved = replace(config, frame=move_frame(placement, config.frame))

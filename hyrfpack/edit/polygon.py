@@ -1,4 +1,4 @@
-"""Polygons on the ground: reading them from files, and which positions lie inside."""
+"""Read polygons on the ground from files, and find the positions inside them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _parse_polygon(content: Any) -> CropPolygon:
     """Convert the content of a file to a polygon.
 
     Raises:
-        TypeError, ValueError, OverflowError: it is not one.
+        TypeError, ValueError, OverflowError: the content is not a polygon.
     """
     entries = content if isinstance(content, dict) else {"points": content}
     if unknown := [key for key in entries if key not in _KEYS]:
@@ -57,8 +57,8 @@ def _parse_polygon(content: Any) -> CropPolygon:
     return CropPolygon(tuple((float(x), float(y), float(z)) for x, y, z in points), **heights)
 
 
-def find_inside(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return whether points (N, 2) lie inside a polygon with corners (M, 2), by the parity of crossings of a ray.
+def inside_mask(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Return a mask (N,) of points (N, 2) inside a polygon with corners (M, 2), by the parity of crossings of a ray.
 
     Points on a side may count either way.
     """
@@ -70,7 +70,7 @@ def find_inside(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return inside
 
 
-def find_corners(corners: np.ndarray) -> np.ndarray:
+def find_distinct_corners(corners: np.ndarray) -> np.ndarray:
     """Return the indices (M,) of the corners of a polygon (N, 2) that do not repeat the one before or close it.
 
     Raises:
@@ -88,7 +88,7 @@ def find_corners(corners: np.ndarray) -> np.ndarray:
         first, second = (kept[side] + 1 for side in sides)
         raise HyrfError(
             f"seen from above, the side after point {first} of the polygon meets the side after point {second}",
-            fix="give the points in the order in which one walks around the polygon",
+            fix="give the points in their order around the polygon",
         )
     return np.array(kept)
 

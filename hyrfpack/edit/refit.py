@@ -37,11 +37,11 @@ from hyrfpack.train.resolution import ResolutionSchedule
 from hyrfpack.train.trainer import shuffled
 
 REFIT_RATES = LearningRates()
-MIN_REGION_PIXELS = 16.0  # A photo with less light of the region, in pixels, is not trained on.
-MIN_REGION_SHARE = 0.5  # of a pixel's light, for the pixel to count in the score of a region
+MIN_REGION_LIGHT_PIXELS = 16.0  # photos with less light of the region show too little of it to be trained on
+MIN_REGION_LIGHT_SHARE = 0.5  # a pixel with a smaller share of light from the region does not count in its score
 
 
-def refit(
+def refit_region(
     model: HybridModel,
     is_selected: np.ndarray,
     views: Sequence[View],
@@ -71,12 +71,12 @@ def refit(
     progress(TaskEvent("finding photos of the region", 0.0))
     with torch.no_grad():
         geometry = model.decode_geometry()
-    light = parallel_map(lambda view: float(region_share(model, geometry, is_selected, view.camera).sum()), views)
-    shown = [view for view, pixels in zip(views, light, strict=True) if pixels >= MIN_REGION_PIXELS]
+    light = parallel_map(lambda view: float(region_light_share(model, geometry, is_selected, view.camera).sum()), views)
+    shown = [view for view, pixels in zip(views, light, strict=True) if pixels >= MIN_REGION_LIGHT_PIXELS]
     if not shown:
         raise HyrfError(
-            f"none of the {len(views)} training photos shows the {format_count(is_selected.sum(), 'Gaussian')} to be "
-            "trained",
+            f"none of the {len(views)} training photos shows the {format_count(is_selected.sum(), 'Gaussian')} of the "
+            "region",
             fix="choose another region",
         )
     cache = PictureCache()
@@ -114,7 +114,7 @@ def refit(
 
 
 @torch.no_grad()
-def region_share(model: HybridModel, geometry: Geometry, is_selected: np.ndarray, camera: Camera) -> Tensor:
+def region_light_share(model: HybridModel, geometry: Geometry, is_selected: np.ndarray, camera: Camera) -> Tensor:
     """Return the share (H, W), in [0, 1], of each pixel's light that comes from selected Gaussians.
 
     Args:
@@ -134,7 +134,7 @@ def region_share(model: HybridModel, geometry: Geometry, is_selected: np.ndarray
 def score_region(models: Sequence[HybridModel], is_selected: np.ndarray, views: Sequence[View]) -> list[float] | None:
     """Return the PSNR in dB of models that differ in a region, on the pixels of photos that show it.
 
-    A pixel counts if more than MIN_REGION_SHARE of its light comes from the region in one of the models.
+    A pixel counts if more than MIN_REGION_LIGHT_SHARE of its light comes from the region in one of the models.
 
     Args:
         models: the models, with the same number of Gaussians.
@@ -149,13 +149,13 @@ def score_region(models: Sequence[HybridModel], is_selected: np.ndarray, views: 
     scores = []
     for view in views:
         shares = torch.stack(
-            [region_share(model, decoded.geometry, is_selected, view.camera) for model, decoded in pairs]
+            [region_light_share(model, decoded.geometry, is_selected, view.camera) for model, decoded in pairs]
         )
         photo, mask = upload(view.load(), solid, shares.device)
-        counted = shares.amax(0) > MIN_REGION_SHARE
+        counted = shares.amax(0) > MIN_REGION_LIGHT_SHARE
         if mask is not None:
             counted &= mask
         if counted.any():
             renders = [render_view(model, view.camera, decoded=decoded).rgb for model, decoded in pairs]
             scores.append([psnr(to_8bit(rgb), photo, counted) for rgb in renders])
-    return [statistics.fmean(each) for each in zip(*scores, strict=True)] if scores else None
+    return [statistics.fmean(values) for values in zip(*scores, strict=True)] if scores else None

@@ -1,4 +1,4 @@
-"""Apply actions to a file in turn, write the result, and measure what it changes in renders."""
+"""Apply actions to a file, write the result, and measure how much renders change."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hyrfpack.compress import CompressionReport
 from hyrfpack.config.edit import Action, EditLimits
 from hyrfpack.context import RunContext
 from hyrfpack.edit.apply import Edit, apply_actions, open_scene
-from hyrfpack.edit.merge import take_part
+from hyrfpack.edit.merge import extract_part
 from hyrfpack.edit.report import EditReport
 from hyrfpack.edit.write import check_limits, write_edit
 from hyrfpack.evaluate import evaluate_model
@@ -43,7 +43,7 @@ def edit_model(
     overwrite: bool = True,
     context: RunContext = RunContext(),  # noqa: B008 - frozen
 ) -> EditReport:
-    """Apply actions to a `.hyrf` file in turn, and write the result to another file.
+    """Apply actions to a `.hyrf` file, one after the other, and write the result to another file.
 
     Moves and backgrounds are exact: they change the file's metadata alone. Where Gaussians are removed, a file of
     profile "compact" or "paper" is quantised again, as by `compress_model`. All parts of a merged file are edited in
@@ -66,7 +66,7 @@ def edit_model(
     Raises:
         HyrfError: a file cannot be read or written, no Gaussian would be left, `part` names none of its parts, an
             action cannot be applied to a merged file, or no file meets a limit.
-        TypeError: `actions` has something else than actions.
+        TypeError: an element of `actions` is not an action.
         ValueError: there is nothing to do.
 
     Example:
@@ -82,13 +82,13 @@ def edit_model(
     if picture is not None:
         outputs.file(picture, *PICTURE_ENDINGS)
     with tempfile.TemporaryDirectory() as folder, context.open_progress("edit") as progress:
-        opened = open_scene(take_part(path, part, folder), path, data, part_of_progress(progress, 0, 0.3))
+        opened = open_scene(extract_part(path, part, folder), path, data, part_of_progress(progress, 0, 0.3))
         check_limits(opened, profile, limits)
         edit = apply_actions(opened, actions)
         writing = replace(context, device="cpu", progress=part_of_progress(progress, 0.3, 0.8))
         written = write_edit(edit, target, profile, limits, overwrite, writing)
         edit = replace(edit, after=replace(edit.after, model=load_model_or_parts(written.file)))
-        report = _measure(edit, part_of_progress(progress, 0.8, 1))
+        report = _measure_changes(edit, part_of_progress(progress, 0.8, 1))
         if picture is not None:
             _save_comparison(picture, edit, overwrite)
     found = written.found if isinstance(written, CompressionReport) else ""
@@ -134,9 +134,9 @@ def plan_edit(
     if picture is not None:
         Outputs(path, scene=data, overwrite=overwrite).file(picture, *PICTURE_ENDINGS)
     with tempfile.TemporaryDirectory() as folder, context.open_progress("edit") as progress:
-        opened = open_scene(take_part(path, part, folder), path, data, part_of_progress(progress, 0, 0.5))
+        opened = open_scene(extract_part(path, part, folder), path, data, part_of_progress(progress, 0, 0.5))
         edit = apply_actions(opened, actions)
-        report = _measure(edit, part_of_progress(progress, 0.5, 1))
+        report = _measure_changes(edit, part_of_progress(progress, 0.5, 1))
         if picture is not None:
             _save_comparison(picture, edit, overwrite)
     return report
@@ -160,13 +160,13 @@ def _check_request(
         raise ValueError("there are no actions; give at least one")
     for action in actions:
         if not isinstance(action, Action):
-            raise TypeError(f"{action!r} is no action of hyrfpack.config.edit")
+            raise TypeError(f"{action!r} is not an action of hyrfpack.config.edit")
     if data is not None:
         check_type("data", data, Scene)
     return find_model(source)
 
 
-def _measure(edit: Edit, progress: Progress) -> EditReport:
+def _measure_changes(edit: Edit, progress: Progress) -> EditReport:
     """Compare renders of both scenes, and score both on held-out photos."""
     cameras = evenly_spaced(edit.before.cameras, MAX_COMPARED_VIEWS)
     changes = []

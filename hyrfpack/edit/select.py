@@ -1,4 +1,4 @@
-"""Which Gaussians an action keeps."""
+"""Decide which Gaussians an action keeps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from hyrfpack.config.edit import (
 from hyrfpack.data.masks import assign_masks
 from hyrfpack.edit.floaters import find_floaters
 from hyrfpack.edit.masks import share_of_light_in_masks
-from hyrfpack.edit.polygon import find_corners, find_inside
+from hyrfpack.edit.polygon import find_distinct_corners, inside_mask
 from hyrfpack.edit.state import EditState
 from hyrfpack.errors import HyrfError
 from hyrfpack.model.merged import MergedModel, parts_of, scene_of
@@ -48,7 +48,7 @@ def _(action: CropBox, state: EditState) -> np.ndarray:
     if action.degrees:
         center = (np.array(action.low) + action.high) / 2
         turn = Placement.rotation_about_axis(state.up, action.degrees).rotation
-        positions = (positions - center) @ turn + center  # turned back, to the axes of the box
+        positions = (positions - center) @ turn + center  # the inverse rotation, into the axes of the box
     return np.asarray(((positions >= action.low) & (positions <= action.high)).all(axis=1))
 
 
@@ -62,7 +62,9 @@ def _(action: CropSphere, state: EditState) -> np.ndarray:
 def _(action: CropCameras, state: EditState) -> np.ndarray:
     east, north = _horizontal_axes(state.up)
     plan = np.stack((east, north), axis=1)
-    corners = np.array([camera.position for camera in state.photo_cameras("to which it could be cropped")]) @ plan
+    corners = (
+        np.array([camera.position for camera in state.photo_cameras("to which the model could be cropped")]) @ plan
+    )
     try:
         hull = ConvexHull(corners)
     except (QhullError, ValueError):
@@ -81,17 +83,17 @@ def _(action: CropCameras, state: EditState) -> np.ndarray:
 def _(action: CropPolygon, state: EditState) -> np.ndarray:
     plan, up = np.stack(_horizontal_axes(state.up), axis=1), state.up / np.linalg.norm(state.up)
     points, positions = np.array(action.points, np.float64), state.world_positions()
-    corners = points[find_corners((points - points[0]) @ plan)]
-    middle = corners.mean(axis=0)  # far from the origin, coordinates about it are more precise
+    corners = points[find_distinct_corners((points - points[0]) @ plan)]
+    middle = corners.mean(axis=0)  # coordinates relative to the polygon stay precise far from the origin
     heights = (positions - middle) @ up
-    inside = find_inside((positions - middle) @ plan, (corners - middle) @ plan)
+    inside = inside_mask((positions - middle) @ plan, (corners - middle) @ plan)
     return inside & (heights >= action.min_height) & (heights <= action.max_height)
 
 
 @keep_mask.register
 def _(action: CropMasks, state: EditState) -> np.ndarray:
     if not state.photos:
-        raise HyrfError("masks belong to photos, and there are none", fix="name the photos with `data`")
+        raise HyrfError("masks belong to photos, but no photos are given", fix="name the photos with `data`")
     if isinstance(state.model, MergedModel):
         raise HyrfError(
             "masks of photos select Gaussians of one model, and this file holds several",
@@ -123,7 +125,7 @@ def _(action: MaxScale, state: EditState) -> np.ndarray:
 def _(action: RemoveFloaters, state: EditState) -> np.ndarray:
     if not state.photos:
         raise HyrfError(
-            "floaters are found by comparing the model with its photos, and there are none",
+            "floaters are found by comparing the model with its photos, but no photos are given",
             fix="name the photos with `data`",
         )
     keep = np.ones(len(state.model), bool)

@@ -1,4 +1,4 @@
-"""The scene between two actions of an edit."""
+"""Hold the state of a scene between two actions of an edit."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class EditState:
         captures: cameras and viewpoint of each part of the file before the edit, by name; "" for a file of one model.
         model: the model, or all parts of a merged file that have Gaussians.
         cameras: the training cameras of the first part, in the model's world coordinates.
-        center: (3,) the point that the cameras look at, likewise.
-        up: (3,) the up direction.
-        photos: the training photos, likewise; empty if they are not given.
+        center: (3,) the point that the cameras look at, in the model's world coordinates.
+        up: (3,) the up direction in the model's world coordinates.
+        photos: the training photos, in the model's world coordinates; empty if no photos are given.
         placement: the map from the world coordinates of the file that is edited.
         progress: called with `TaskEvent`s.
-        held_out: the held-out photos, likewise.
+        held_out: the held-out photos, in the model's world coordinates.
         has_gains: whether the model was trained with per-image gains, so that photos differ from it in exposure.
-        has_scene: whether the first part is the one that the photos show. An edit may leave nothing of that one.
-        has_chosen_up: whether an action chose `up`, which then also holds if the first part is left out.
+        has_scene: whether the first part is the one that the photos show. An edit may remove that part.
+        has_chosen_up: whether an action chose `up`, which is then kept if the first part is removed.
     """
 
     source: Path
@@ -62,16 +62,16 @@ class EditState:
         """Return the cameras of the photos that show the first part, or those that its file keeps.
 
         Args:
-            purpose: what needs them, as the end of "it keeps no cameras, ".
+            purpose: what the cameras are needed for, as the end of the sentence "it keeps no cameras ...".
 
         Raises:
-            HyrfError: there are neither.
+            HyrfError: there are neither photos nor cameras.
         """
         if self.has_scene and self.photos:
             return [view.camera for view in self.photos]
         if self.capture.is_synthetic:
             raise HyrfError(
-                f"{self.source}: it keeps no cameras, {purpose}",
+                f"{self.source}: this file keeps no cameras {purpose}",
                 fix="name the photos with `data`, or give numbers instead",
             )
         return self.cameras

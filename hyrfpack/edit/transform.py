@@ -30,7 +30,7 @@ def placement_of(move: Move) -> Placement:
     """Return the map of a move.
 
     Raises:
-        TypeError: it is no move.
+        TypeError: the argument is not a move.
     """
     if isinstance(move, Translate):
         return Placement.translation(move.offset)
@@ -38,7 +38,7 @@ def placement_of(move: Move) -> Placement:
         return Placement.rotation_about_axis(move.axis, move.degrees)
     if isinstance(move, Scale):
         return Placement(move.factor)
-    raise TypeError(f"{move!r} is no move; use Translate, Rotate or Scale of hyrfpack.config.edit")
+    raise TypeError(f"{move!r} is not a move; use Translate, Rotate or Scale of hyrfpack.config.edit")
 
 
 def move_frame(placement: Placement, frame: Frame) -> Frame:
@@ -52,14 +52,14 @@ def move_frame(placement: Placement, frame: Frame) -> Frame:
     reach = max(abs(x), abs(y), abs(z), scale)
     if not (MIN_FRAME_SCALE <= scale and reach <= MAX_WORLD_COORDINATE):
         raise HyrfError(
-            f"moves take the scene's centre to ({x:g}, {y:g}, {z:g}) and its half size to {scale:g}; sizes of at "
-            f"least {MIN_FRAME_SCALE:g} and coordinates of at most {MAX_WORLD_COORDINATE:g} are possible",
+            f"moves take the scene's centre to ({x:g}, {y:g}, {z:g}) and its half size to {scale:g}; sizes must be "
+            f"at least {MIN_FRAME_SCALE:g} and coordinates at most {MAX_WORLD_COORDINATE:g}",
             fix="move and scale it by less",
         )
     if reach > MAX_DISTANCE_RATIO * scale:
         raise HyrfError(
-            f"moves take the scene's centre to ({x:g}, {y:g}, {z:g}), {reach / scale:.2g} times its half size off; "
-            f"up to {MAX_DISTANCE_RATIO:g} times, numbers are fine enough to keep its shape",
+            f"moves take the scene's centre to ({x:g}, {y:g}, {z:g}), {reach / scale:.2g} times its half size from the "
+            f"origin; beyond {MAX_DISTANCE_RATIO:g} times, float64 cannot hold its shape precisely enough",
             fix="move it by less",
         )
     w, i, j, k = (quaternion_from_matrix(placement.rotation @ frame.axes) + 0.0).tolist()  # + 0.0 turns -0.0 into 0.0

@@ -58,7 +58,7 @@ def write_edit(
     overwrite: bool,
     context: RunContext,
 ) -> FileReport:
-    """Write an edited scene. Models of which only metadata differ from those of the source keep all their numbers.
+    """Write an edited scene. A model of which only the metadata changed keeps all its numbers.
 
     A merged file of which one part is left becomes a file of one model. The arguments `profile` and `limits` are those
     of `check_limits`.
@@ -69,20 +69,22 @@ def write_edit(
     settings = [_choose_settings(part, profile, limits) for part in edit.parts]
     copies = [_copy_numbers(edit, *pair) for pair in zip(edit.parts, settings, strict=True)]
     if limits.max_psnr_drop is None and all(copy is not None for copy in copies):
-        copy = _join(edit, [copy for copy in copies if copy is not None])
+        copy = _join_models(edit, [copy for copy in copies if copy is not None])
         if limits.target_bytes is None or len(copy) <= limits.target_bytes:
-            return _write(copy, target, overwrite)
+            return _write_file(copy, target, overwrite)
     if limits == EditLimits() and len(copies) > 1:
         encoded = []
         with context.open_progress() as progress:
-            for number, (part, config, done) in enumerate(zip(edit.parts, settings, copies, strict=True)):
+            for number, (part, config, copied) in enumerate(zip(edit.parts, settings, copies, strict=True)):
                 share = part_of_progress(progress, number / len(copies), (number + 1) / len(copies))
-                encoded.append(done or _encode_part(edit, part, config, replace(context, progress=share)))
-        return _write(_join(edit, encoded), target, overwrite)
+                encoded.append(copied or _encode_part(edit, part, config, replace(context, progress=share)))
+        return _write_file(_join_models(edit, encoded), target, overwrite)
     photos = None if edit.data is None or limits.max_psnr_drop is None else _unchanged_photos(edit, edit.data)
     with tempfile.TemporaryDirectory() as folder:
         edited = Path(folder, "edited.hyrf")
-        write_atomic(edited, _join(edit, [encode_model(part.after, "raw", part.provenance) for part in edit.parts]))
+        write_atomic(
+            edited, _join_models(edit, [encode_model(part.after, "raw", part.provenance) for part in edit.parts])
+        )
         try:
             with named_in_errors(edited, str(edit.source)):
                 return compress_model(edited, target, settings[0], data=photos, overwrite=overwrite, context=context)
@@ -122,12 +124,12 @@ def _encode_part(edit: Edit, part: EditedPart, config: CompressConfig, context: 
         return packed.read_bytes()
 
 
-def _join(edit: Edit, models: Sequence[bytes]) -> bytes:
+def _join_models(edit: Edit, models: Sequence[bytes]) -> bytes:
     """Return the bytes of a file of one model, or of a merged file of all models."""
     return models[0] if len(models) == 1 else encode_parts([*zip((p.name for p in edit.parts), models, strict=True)])
 
 
-def _write(data: bytes, target: StrPath, overwrite: bool) -> FileReport:
+def _write_file(data: bytes, target: StrPath, overwrite: bool) -> FileReport:
     """Write the bytes of a file of one model or of several."""
     write = write_merged if PART_NAMES in read_container(data, SECTION_CONTENTS).entries else write_model
     return write(data, target, overwrite=overwrite)

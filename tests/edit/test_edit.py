@@ -214,7 +214,7 @@ def test_cameras_surround_the_inside_of_their_hull_at_any_height(margin, half_si
 
 def test_a_file_without_cameras_is_not_cropped_to_cameras(tmp_path):
     save_model(load_model(RAW_FILE), tmp_path / "bare.hyrf")
-    with pytest.raises(HyrfError, match="bare.hyrf: it keeps no cameras, to which it could be cropped"):
+    with pytest.raises(HyrfError, match="bare.hyrf: this file keeps no cameras to which the model could be cropped"):
         plan_edit(tmp_path / "bare.hyrf", [Remove(CropCameras(0.1))], context=QUIET_CONTEXT)
 
 
@@ -378,7 +378,7 @@ def test_up_is_estimated_in_the_axes_of_the_rotated_scene(tmp_path):
 def test_up_cannot_be_estimated_without_cameras(tmp_path):
     save_model(load_model(RAW_FILE), tmp_path / "bare.hyrf")
     sentence = refused("edit", tmp_path / "bare.hyrf", "--plan", "--up", "auto")
-    assert "it keeps no cameras, from which up could be estimated" in sentence
+    assert "this file keeps no cameras from which up could be estimated" in sentence
 
 
 def test_the_command_turns_a_scene_upright_and_says_how(tmp_path):
@@ -414,10 +414,13 @@ def test_an_edit_that_leaves_nothing_is_refused_and_writes_nothing(tmp_path):
         (["--plan", "--crop-sphere", "0,0,0"], "is not 4 numbers"),
         (["--plan", "--translate", "nan,0,0"], "is not 3 numbers"),
         (["--plan", "--crop-cameras", "-1"], "--crop-cameras: margin is -1.0"),
-        (["--plan", "--scale", "1e300"], "coordinates of at most 1e+30 are possible; move and scale it by less"),
-        (["--plan", "--scale", "1e-300"], "sizes of at least 1e-30"),
+        (["--plan", "--scale", "1e300"], "coordinates at most 1e+30; move and scale it by less"),
+        (["--plan", "--scale", "1e-300"], "sizes must be at least 1e-30"),
         (["--plan", "--translate", "0,-1e300,0"], "-1e+300"),
-        (["--plan", "--translate", "0,-1e20,0"], "times, numbers are fine enough to keep its shape; move it by less"),
+        (
+            ["--plan", "--translate", "0,-1e20,0"],
+            "times, float64 cannot hold its shape precisely enough; move it by less",
+        ),
         (["--center"], "give either -o FILE"),
         (["--plan", "--center", "--profile", "raw"], "leave out --profile"),
         (["--plan", "-o", "out.hyrf", "--center"], "give either -o FILE"),
@@ -432,5 +435,5 @@ def test_options_that_make_no_sense_are_refused(options, problem):
 def test_edit_model_checks_its_actions(tmp_path):
     with pytest.raises(ValueError, match="no actions"):
         edit_model(COMPACT_FILE, tmp_path / "out.hyrf", [])
-    with pytest.raises(TypeError, match="no action of hyrfpack.config.edit"):
+    with pytest.raises(TypeError, match="not an action of hyrfpack.config.edit"):
         edit_model(COMPACT_FILE, tmp_path / "out.hyrf", ["crop"])

@@ -65,7 +65,7 @@ def plant(model: HybridModel, cameras: list[Camera]) -> tuple[HybridModel, np.nd
 @pytest.fixture(autouse=True)
 def quick_comparison(monkeypatch):
     """Compare the model with its few small photos in a quarter of the steps, which are enough for them."""
-    monkeypatch.setattr("hyrfpack.edit.floaters.MIN_STEPS", 150)
+    monkeypatch.setattr("hyrfpack.edit.floaters.MIN_FADING_STEPS", 150)
 
 
 @pytest.fixture(scope="module")

@@ -153,16 +153,16 @@ def test_a_model_without_gaussians_is_refused(tmp_path: Path, files: tuple[Path,
     assert not (tmp_path / "both.hyrf").exists()
 
 
-def test_an_action_that_is_no_move_is_a_type_error(tmp_path: Path, files: tuple[Path, Path]):
-    with pytest.raises(TypeError, match="no move"):
+def test_an_action_that_is_not_a_move_is_a_type_error(tmp_path: Path, files: tuple[Path, Path]):
+    with pytest.raises(TypeError, match="is not a move"):
         merge_models(files, tmp_path / "both.hyrf", {"balls": [Center()]})  # type: ignore[list-item]
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("room.hyrf balls.hyrf -o out.hyrf --translate lamp=1,0,0", "'lamp', and none of the models room, balls"),
-        ("room.hyrf room.hyrf -o out.hyrf --scale room=2", "several of the models"),
+        ("room.hyrf balls.hyrf -o out.hyrf --translate lamp=1,0,0", "'lamp', but none of the models room, balls"),
+        ("room.hyrf room.hyrf -o out.hyrf --scale room=2", "more than one of the models"),
         ("room.hyrf balls.hyrf -o out.hyrf --translate balls=1,0", "is not 3 numbers"),
         ("room.hyrf balls.hyrf -o out.hyrf --translate 1,0,0", "names no model"),
         ("room.hyrf balls.hyrf -o out.hyrf --scale balls=0", "--scale"),
@@ -205,7 +205,7 @@ def test_a_message_about_a_part_names_the_merged_file(tmp_path: Path, files: tup
 
     error = refused("edit", "both.hyrf", "--plan", "--part", "plain", "--up", "auto")
 
-    assert error.startswith("Error: both.hyrf: it keeps no cameras")
+    assert error.startswith("Error: both.hyrf: this file keeps no cameras")
 
 
 def test_the_commands_read_what_merge_writes(tmp_path: Path, files: tuple[Path, Path]):

@@ -183,9 +183,9 @@ def test_a_part_that_is_left_with_nothing_is_left_out_with_a_note(merged, tmp_pa
 
     assert "parts" not in describe_file(kept_room.file) and len(load_model(kept_room.file))
     notes = " | ".join(caplog.messages)
-    assert "part 'toy' has no Gaussian left, and is left out" in notes
-    assert "part 'room' has no Gaussian left, and is left out" in notes
-    assert "those of part 'toy' now" in notes
+    assert "part 'toy' has no Gaussian left and is left out" in notes
+    assert "part 'room' has no Gaussian left and is left out" in notes
+    assert "the cameras of part 'toy'" in notes
     assert load_model(only_toy.file).config.frame == load_merged_model(merged).parts[1].config.frame
 
 
@@ -300,8 +300,8 @@ def test_the_loss_is_limited_on_the_pixels_that_show_the_scene(merged, tmp_path)
 
 def test_photos_say_only_which_gaussians_of_the_scene_are_floaters(merged, tmp_path, monkeypatch):
     """Photos do not show the other parts, which would all be floaters to them."""
-    monkeypatch.setattr(floaters, "MIN_STEPS", 8)
-    monkeypatch.setattr(floaters, "MIN_PASSES", 1)
+    monkeypatch.setattr(floaters, "MIN_FADING_STEPS", 8)
+    monkeypatch.setattr(floaters, "MIN_FADING_PASSES", 1)
     scene, action = ball_scene(4), RemoveFloaters(0.9)
 
     together = plan_edit(merged, [action], data=scene, context=QUIET_CONTEXT).actions[0]

@@ -16,7 +16,7 @@ from scenes import QUIET_CONTEXT
 
 from hyrfpack.config.edit import CropPolygon, Remove, Translate, Up
 from hyrfpack.edit import plan_edit
-from hyrfpack.edit.polygon import find_corners, find_inside, read_polygon
+from hyrfpack.edit.polygon import find_distinct_corners, inside_mask, read_polygon
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.format import load_model
 
@@ -46,15 +46,15 @@ def test_concave_polygons_hold_the_points_that_matplotlib_finds_in_them(corner_c
     corners = radii[:, None] * np.stack((np.cos(angles), np.sin(angles)), axis=1)
     points = generator.uniform(-1.1, 1.1, (500, 2))
     expected = MatplotlibPath(corners).contains_points(points)
-    assert (find_inside(points, corners) == expected).all()
-    assert (find_inside(points, corners[::-1]) == expected).all()
+    assert (inside_mask(points, corners) == expected).all()
+    assert (inside_mask(points, corners[::-1]) == expected).all()
 
 
 def test_an_l_shape_is_the_union_of_two_rectangles():
     points = np.random.default_rng(0).uniform(-1, 5, (4000, 2))
     x, y = points.T
     expected = ((0 < x) & (x < 4) & (0 < y) & (y < 1)) | ((0 < x) & (x < 1) & (0 < y) & (y < 3))
-    assert (find_inside(points, L_SHAPE) == expected).all() and 0 < expected.sum() < len(points)
+    assert (inside_mask(points, L_SHAPE) == expected).all() and 0 < expected.sum() < len(points)
 
 
 # -- sides that meet --------------------------------------------------------------------------------------------------
@@ -91,23 +91,23 @@ def test_polygons_are_refused_exactly_if_two_of_their_sides_meet(points):
     ) or any(leads_back(corners[i - 1], corners[i], corners[(i + 1) % count]) for i in range(count))
     if meet:
         with pytest.raises(HyrfError, match="meets the side after point"):
-            find_corners(corners)
+            find_distinct_corners(corners)
     else:
-        assert find_corners(corners).tolist() == list(range(count))
+        assert find_distinct_corners(corners).tolist() == list(range(count))
 
 
 @pytest.mark.parametrize("closing", [0, 1, 2])
 def test_messages_number_the_points_as_they_were_given(closing):
     corners = np.array([(0, 0), (1, 1), (1, 0), (0, 1)], float)
     with pytest.raises(HyrfError, match="the side after point 1 .* the side after point 3"):
-        find_corners(np.concatenate((corners, np.repeat(corners[:1], closing, axis=0))))
+        find_distinct_corners(np.concatenate((corners, np.repeat(corners[:1], closing, axis=0))))
 
 
 def test_a_closing_corner_and_repetitions_are_dropped():
     closed = np.concatenate((L_SHAPE[:2], L_SHAPE[1:], L_SHAPE[:1]))
-    assert find_corners(closed).tolist() == [0, 1, *range(3, len(closed) - 1)]
+    assert find_distinct_corners(closed).tolist() == [0, 1, *range(3, len(closed) - 1)]
     with pytest.raises(HyrfError, match="fewer than three corners"):
-        find_corners(np.array([(0, 0), (1, 0), (1, 0), (0, 0)], float))
+        find_distinct_corners(np.array([(0, 0), (1, 0), (1, 0), (0, 0)], float))
 
 
 # -- edits ------------------------------------------------------------------------------------------------------------
@@ -200,5 +200,5 @@ def test_a_polygon_whose_sides_cross_is_refused_with_the_points(tmp_path):
     (tmp_path / "bow.json").write_text("[[0, 0, 0], [1, 1, 0], [1, 0, 0], [0, 1, 0]]")
     sentence = refused("edit", MODEL_FILE, "--plan", "--up", "0,0,1", "--crop-polygon", tmp_path / "bow.json")
     assert "the side after point 1 of the polygon meets the side after point 3" in sentence
-    assert "walks around" in sentence
+    assert "in their order around the polygon" in sentence
     assert "cannot be read" in refused("edit", MODEL_FILE, "--plan", "--crop-polygon", tmp_path / "missing.json")

@@ -15,7 +15,7 @@ from scenes import QUIET_CONTEXT
 
 from hyrfpack.config.edit import CropBox, CropSphere, Refit, Remove, Scale, Translate
 from hyrfpack.edit import edit_model, merge_models, plan_edit
-from hyrfpack.edit.refit import refit, score_region
+from hyrfpack.edit.refit import refit_region, score_region
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import load_model, save_model
 from hyrfpack.format.codec import load_with_provenance
@@ -101,7 +101,7 @@ def test_photos_of_other_exposure_do_not_change_the_colours(scene, model, is_ins
     views = [exposed(view) for view in scene.train]
     changes = []
     for has_gains in (True, False):
-        trained = refit(model, is_inside, views, STEPS, has_gains=has_gains)
+        trained = refit_region(model, is_inside, views, STEPS, has_gains=has_gains)
         change = torch.sigmoid(trained.gaussians.color_logits) - torch.sigmoid(model.gaussians.color_logits)
         changes.append(float(change[torch.from_numpy(is_inside)].mean(0).abs().max()))
     assert changes[0] < 0.03 and changes[1] > 3 * changes[0]
@@ -115,15 +115,15 @@ def test_the_outside_of_a_region_can_be_trained(scene, is_inside, damaged_file):
 
 def test_a_region_without_gaussians_or_photos_is_refused(scene, model, damaged_file):
     nowhere = Refit(CropBox((90.0, 90.0, 90.0), (91.0, 91.0, 91.0)))
-    with pytest.raises(HyrfError, match="no Gaussian lies there"):
+    with pytest.raises(HyrfError, match="its region holds no Gaussian"):
         plan_edit(damaged_file, [nowhere], data=scene, context=QUIET_CONTEXT)
-    with pytest.raises(HyrfError, match="trained on photos, and there are none"):
+    with pytest.raises(HyrfError, match="trained on photos, but no photos are given"):
         plan_edit(damaged_file, [Refit(CENTER_BALL)], context=QUIET_CONTEXT)
     hidden = copy.deepcopy(model)
     hidden.gaussians.positions[0] = torch.tensor([0.0, 0.0, 60.0])
     is_selected = np.arange(len(model)) == 0
-    with pytest.raises(HyrfError, match="training photos shows the 1 Gaussian to"):
-        refit(hidden, is_selected, scene.train, 1)
+    with pytest.raises(HyrfError, match="training photos shows the 1 Gaussian of the region"):
+        refit_region(hidden, is_selected, scene.train, 1)
 
 
 def test_photos_without_a_pixel_to_train_on_change_nothing_that_is_not_finite(scene, model, is_inside):
@@ -134,7 +134,7 @@ def test_photos_without_a_pixel_to_train_on_change_nothing_that_is_not_finite(sc
         )
         for view in scene.train
     ]
-    trained = refit(model, is_inside, masked, 3)
+    trained = refit_region(model, is_inside, masked, 3)
     assert all(values.isfinite().all() for values in trained.parameters())
 
 

@@ -26,7 +26,7 @@ import hyrfpack
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.config.edit import DEFAULT_REFIT_STEPS
 from hyrfpack.config.train import LearningRates
-from hyrfpack.edit.refit import REFIT_RATES, refit, score_region
+from hyrfpack.edit.refit import REFIT_RATES, refit_region, score_region
 from hyrfpack.model import HybridModel
 from tools.command import run_command
 from tools.studies.trained_runs import load_runs, make_runs_parser
@@ -102,7 +102,7 @@ def main() -> None:
                     start = time.perf_counter()
                     rates = scale_rates(REFIT_RATES, factor)
                     has_gains = model.exposure is not None
-                    repaired = refit(damaged, is_selected, trained, steps, has_gains=has_gains, rates=rates)
+                    repaired = refit_region(damaged, is_selected, trained, steps, has_gains=has_gains, rates=rates)
                     seconds = time.perf_counter() - start
                     psnrs = score_region((model, damaged, repaired), is_selected, scored) or []
                     scores = [f"{psnr:.2f}" for psnr in psnrs]
