@@ -34,8 +34,8 @@ def write_level_scene(folder: Path) -> Path:
     kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
     save_model(model, folder / "model.hyrf", provenance=kept)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(split, "REFIT_CAMERAS", 1)
-        patch.setattr(split, "MEASURED_VIEWS", 2)
+        patch.setattr(split, "REFIT_CAMERAS_PER_PART", 1)
+        patch.setattr(split, "MEASURED_VIEWS_PER_PART", 2)
         config = SplitConfig(chunk_gaussians=64, levels=3, refit_steps=1)
         split_model(folder / "model.hyrf", folder / "scene", config, context=RunContext(progress=None))
     return folder / "scene"

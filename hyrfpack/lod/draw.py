@@ -1,4 +1,4 @@
-"""Draws a scene folder at the levels of detail that suit each view."""
+"""Draw a scene folder at the levels of detail that suit each view."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from hyrfpack.render import RenderedPicture, RenderSettings
 from hyrfpack.render.files import make_renderer
 from hyrfpack.scene import Camera
 
-# At most this many Gaussians of chunks are kept for later views.
 MAX_CACHED_GAUSSIANS = 8_000_000
 
 
@@ -45,23 +44,24 @@ class LevelRenderer:
         """Check the limits of each view, see `select_levels`.
 
         Raises:
-            HyrfError: a view within the limit could have no Gaussian.
+            HyrfError: the limit is too small for any chunk.
         """
         levels = [level for chunk in scene.manifest.chunks for level in chunk.levels]
         if bytes is None:
-            unit, given, least = "Gaussians", gaussians, min((level.gaussians for level in levels), default=0)
+            unit, limit, min_limit = "Gaussians", gaussians, min((level.gaussians for level in levels), default=0)
         else:
-            unit, given = "bytes", bytes
-            least = scene.manifest.shared_bytes + min((level.bytes for level in levels), default=0)
-        if given is not None and given < least:
+            unit, limit = "bytes", bytes
+            min_limit = scene.manifest.shared_bytes + min((level.bytes for level in levels), default=0)
+        if limit is not None and limit < min_limit:
             raise HyrfError(
-                f"{scene.path}: no chunk can be drawn within {given:,} {unit}", fix=f"allow at least {least:,} {unit}"
+                f"{scene.path}: no chunk can be drawn within {limit:,} {unit}",
+                fix=f"allow at least {min_limit:,} {unit}",
             )
         self.scene, self.gaussians, self.bytes = scene, gaussians, bytes
         self.choices: list[LevelSelection] = []
         self._device, self._precision = device, precision
         self._chunks: OrderedDict[tuple[int, int], HybridModel] = OrderedDict()
-        # The model of the last view with its levels, and its renderer, because neighbouring views often have the same.
+        # The levels and the model of the last view, and its renderer, because neighbouring views often share them.
         self._last: tuple[list[int | None], HybridModel | MergedModel] | None = None
         self._last_renderer: tuple[GeometryConfig, RenderSettings, Callable[[Camera], RenderedPicture]] | None = None
 
@@ -77,7 +77,7 @@ class LevelRenderer:
         self.choices.append(choice)
         if self._last is None or self._last[0] != choice.levels:
             self._last = self._last_renderer = None  # frees the memory before the next model is joined
-            self._last = choice.levels, self._join(choice.levels)
+            self._last = choice.levels, self._join_chunks(choice.levels)
         return self._last[1], choice
 
     def draw(
@@ -95,8 +95,9 @@ class LevelRenderer:
             last = self._last_renderer = geometry, settings, make_renderer(model, geometry=geometry, settings=settings)
         return last[2](camera)
 
-    def _join(self, levels: list[int | None]) -> HybridModel | MergedModel:
-        chunks = [None if level is None else self._chunk(number, level) for number, level in enumerate(levels)]
+    def _join_chunks(self, levels: list[int | None]) -> HybridModel | MergedModel:
+        """Return one model of the chunks at these levels, which shares the fields of this renderer."""
+        chunks = [None if level is None else self._load_chunk(number, level) for number, level in enumerate(levels)]
         model = self.scene.join(chunks)
         for part, (geometry, radiance) in zip(parts_of(model), self._fields, strict=True):
             part.geometry, part.radiance = geometry, radiance
@@ -106,13 +107,14 @@ class LevelRenderer:
 
     @cached_property
     def _fields(self) -> list[tuple[Field, Field]]:
-        """The fields of each part on the device. They are copies, because moving them would move those of `scene`."""
+        """Return the fields of each part on the device, as copies, because moving them would move those of `scene`."""
         return [
             (deepcopy(part.geometry).to(self._device), deepcopy(part.radiance).to(self._device))
             for part in self.scene.fields
         ]
 
-    def _chunk(self, number: int, level: int) -> HybridModel:
+    def _load_chunk(self, number: int, level: int) -> HybridModel:
+        """Return the model of a chunk at a level, from the cache if possible."""
         key = (number, level)
         if key not in self._chunks:
             self._chunks[key] = self.scene.load_chunk(number, level)

@@ -1,4 +1,4 @@
-"""Encodes the files of a scene: one with the shared sections, and chunks that refer to it."""
+"""Encode the files of a scene folder: one with the shared sections, and chunks that refer to it."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ from hyrfpack.lod.residuals import LayerResiduals
 from hyrfpack.model import HybridModel
 from hyrfpack.quant.points import LatticePoints, decode_points, encode_points
 
-# Numbers that were predicted from neighbours cannot be kept exactly among others, so their steps become finer: an
-# octave halves the step, and the error falls by 6 dB.
-FINER_OCTAVES = 1
+# A number that is stored as its difference from a prediction changes by up to half a step if a chunk predicts it from
+# other neighbours. So its step is made finer by this many octaves; each halves the step and lowers the error by 6 dB.
+FINER_STEP_OCTAVES = 1
 _CODES_PER_OCTAVE = 8
 
 
@@ -71,14 +71,15 @@ class LayerNumbers:
 
 
 class ChunkEncoder:
-    """Encodes chunks of a model so that their numbers stay as they are stored in its file.
+    """Encodes chunks of a model and keeps the numbers of its file, exactly or nearly so.
 
     Attributes:
         model: the model of the file, on the CPU.
         metadata: the metadata of the file.
-        is_compact: whether chunks are of profile "compact", as those of a compact file; others are "raw".
+        is_compact: whether the file and its chunks have the profile "compact"; otherwise chunks have "raw".
+        profile: profile of the chunks.
         shared_name: name of the shared file.
-        shared_bytes: its bytes.
+        shared_bytes: bytes of the shared file.
     """
 
     def __init__(self, container: Container, model: HybridModel, shared_name: str) -> None:
@@ -94,13 +95,13 @@ class ChunkEncoder:
         """Encode the Gaussians at ascending `index` (n,) int64.
 
         Positions are kept exactly. So are logits of raw files, and of compact files where they were stored without
-        prediction; others get steps that are finer by FINER_OCTAVES octaves.
+        prediction; others get steps that are finer by FINER_STEP_OCTAVES octaves.
 
         Returns:
-            The bytes of the file, and (n,) the index of the Gaussian at each place of it.
+            The bytes of the chunk, and (n,) the index of the Gaussian at each place of the chunk.
         """
         if not self.is_compact:
-            return self._write_raw(self.model.subset(torch.from_numpy(index))), index
+            return self._encode_raw(self.model.subset(torch.from_numpy(index))), index
         sections: list[Section] = []
         counts: list[int] = []
         order, start = [], 0
@@ -115,24 +116,24 @@ class ChunkEncoder:
                     requantize_channel(values[members], points.classes, *_exact_or_finer(*header))
                     for values, header in zip(layer.values, layer.headers, strict=True)
                 ]
-                sections += self._sections(len(counts), points, data, channels)
+                sections += self._make_sections(len(counts), points, data, channels)
                 for residuals in layer.residuals:
                     stored = residuals.encode_subset(members, points.classes)
-                    sections.append(self._residual_section(residuals.group, len(counts), stored, len(members)))
+                    sections.append(self._make_residual_section(residuals.group, len(counts), stored, len(members)))
                 counts.append(len(members))
                 order.append(members + start)
             start += count
-        return self._write(sections, counts), np.concatenate(order or [index])
+        return self._encode_chunk(sections, counts), np.concatenate(order or [index])
 
     def encode_gaussians(self, model: HybridModel) -> bytes:
         """Encode Gaussians that are not in the file, with the steps that are most common in its first layer."""
         if not self.is_compact:
-            return self._write_raw(model)
+            return self._encode_raw(model)
         layer = self._layers[0]
-        kind = int(np.bincount(layer.points.classes, minlength=1).argmax())
+        most_common_class = int(np.bincount(layer.points.classes, minlength=1).argmax())
         arrays = to_arrays(model)
         cube = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
-        classes = np.full(len(model), kind, np.uint8)
+        classes = np.full(len(model), most_common_class, np.uint8)
         data, order, points = encode_points(snap_to_lattice(cube, classes, layer.points.bits), keep_bits=True)
         numbers = np.concatenate([arrays[group] for group in LOGIT_SECTIONS], axis=1)[order].astype(np.float64)
         numbers[:, :3] = numbers[:, :3] @ self._basis
@@ -140,11 +141,11 @@ class ChunkEncoder:
             requantize_channel(values, classes, codes, np.float32(values.mean() if len(values) else 0))
             for values, (_, _, codes) in zip(numbers.T, layer.headers, strict=True)
         ]
-        sections = self._sections(0, points, data, channels)
+        sections = self._make_sections(0, points, data, channels)
         for residuals in layer.residuals:
             stored = residuals.encode_values(arrays[residuals.group][order], points.classes)
-            sections.append(self._residual_section(residuals.group, 0, stored, len(model)))
-        return self._write(sections, [len(model)])
+            sections.append(self._make_residual_section(residuals.group, 0, stored, len(model)))
+        return self._encode_chunk(sections, [len(model)])
 
     @cached_property
     def _basis(self) -> np.ndarray:
@@ -153,6 +154,7 @@ class ChunkEncoder:
 
     @cached_property
     def _layers(self) -> list[LayerNumbers]:
+        """The quantised numbers of each layer of the file."""
         counts, layers = self.metadata.layers or [self.metadata.gaussians], []
         for number, count in enumerate(counts):
             points = decode_points(self._file[layer_section(POSITIONS, number)].data, count)
@@ -175,6 +177,7 @@ class ChunkEncoder:
 
     @cached_property
     def _residual_widths(self) -> dict[str, int]:
+        """The number of columns of each section of residuals."""
         return residual_widths(self.model.config)
 
     def _encode_shared(self) -> bytes:
@@ -188,9 +191,12 @@ class ChunkEncoder:
                 uses = encode_use_classes(groups, grid_configs(config)[section.type].offsets, USAGE_CLASS_COUNT)
                 sections[place] = replace(section, codec=CODEC_STATED_GROUPS, data=uses + bytes(section.data))
         metadata = replace(self.metadata, gaussians=0, layers=[], writer=writer_name())
-        return _write_file(metadata, [*sections, *empty], deflate=self.is_compact)
+        return _encode_file(metadata, [*sections, *empty], deflate=self.is_compact)
 
-    def _sections(self, layer: int, points: LatticePoints, data: bytes, channels: Sequence[Channel]) -> list[Section]:
+    def _make_sections(
+        self, layer: int, points: LatticePoints, data: bytes, channels: Sequence[Channel]
+    ) -> list[Section]:
+        """Return the sections of a layer: encoded positions `data`, and the logits of `channels`."""
         count = len(points.classes)
         sections = [Section(layer_section(POSITIONS, layer), CODEC_POINTS, data, 12 * count)]
         rest = [encode_channel(channel, points.classes) for channel in channels]
@@ -201,14 +207,16 @@ class ChunkEncoder:
             rest = rest[columns:]
         return sections
 
-    def _residual_section(self, group: str, layer: int, stored: bytes, count: int) -> Section:
+    def _make_residual_section(self, group: str, layer: int, stored: bytes, count: int) -> Section:
+        """Return the section of the encoded residuals of a layer."""
         return Section(layer_section(group, layer), CODEC_RESIDUALS, stored, 4 * self._residual_widths[group] * count)
 
-    def _write_raw(self, model: HybridModel) -> bytes:
+    def _encode_raw(self, model: HybridModel) -> bytes:
+        """Return the bytes of a chunk of profile "raw"."""
         sections, _ = raw.encode(model, layered_groups(model.config))
-        return self._write(sections, [len(model)])
+        return self._encode_chunk(sections, [len(model)])
 
-    def _write(self, sections: list[Section], counts: list[int]) -> bytes:
+    def _encode_chunk(self, sections: list[Section], counts: list[int]) -> bytes:
         """Return the bytes of a chunk: its own sections, and references to the shared ones."""
         shared = [self._shared.entries[tag] for tag in SHARED_SECTIONS if tag in self._shared.entries]
         references = [refer_to_section(entry, self.shared_name) for entry in shared]
@@ -216,17 +224,18 @@ class ChunkEncoder:
         metadata = replace(
             self.metadata, profile=self.profile, gaussians=sum(counts), layers=layers, settings={}, provenance={}
         )
-        return _write_file(metadata, [*references, *sections], deflate=self.is_compact)
+        return _encode_file(metadata, [*references, *sections], deflate=self.is_compact)
 
 
 def _exact_or_finer(mean: np.float32, weight: int, codes: np.ndarray) -> tuple[np.ndarray, np.float32, int | None]:
     """Return step codes, mean and weight that keep the numbers of a channel exactly, or with finer steps."""
     if weight == 0:
         return codes, mean, 0
-    finer = codes.astype(np.int64) - _CODES_PER_OCTAVE * FINER_OCTAVES
+    finer = codes.astype(np.int64) - _CODES_PER_OCTAVE * FINER_STEP_OCTAVES
     return np.maximum(finer, MIN_STEP_CODE).astype(np.uint8), mean, None
 
 
-def _write_file(metadata: Metadata, sections: list[Section], deflate: bool) -> bytes:
+def _encode_file(metadata: Metadata, sections: list[Section], deflate: bool) -> bytes:
+    """Return the bytes of a file of the lowest version that has these sections."""
     sections = [metadata.to_section(deflate=deflate), *sections]
     return write_container(sections, minor=lowest_minor_version(sections, metadata.config))

@@ -1,4 +1,4 @@
-"""Measures the errors of levels of detail in pictures, for each chunk and several sizes of its projection."""
+"""Measure the errors of levels of detail in pictures, for each chunk and several sizes of its projection."""
 
 from __future__ import annotations
 
@@ -23,14 +23,16 @@ from hyrfpack.render.renderer import raster_settings_of
 from hyrfpack.scene import Camera
 
 ERROR_RADII = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0)
-# Views are measured at these shares of the photos' resolution, in turn. A coarser picture is a view from farther away.
-# Two resolutions of twice as many views predict other views better than four of each view.
-RESOLUTION_SHARES = ((1.0, 1 / 4), (1 / 2, 1 / 8))
-# A pixel of which a half of the chunks has a smaller share counts less, because its error comes from elsewhere.
-MIN_SHARE = 1e-3
-# Errors of a chunk whose light in all views, at a radius, adds up to less than this are errors of its neighbours.
+# Views are rendered at these ratios of the resolution of photos: the first at those of the first group, the second at
+# those of the second, and so on in turn. A coarser picture stands for a view from farther away. Two resolutions of
+# twice as many views predict other views better than four resolutions of each view.
+RESOLUTION_RATIOS = ((1.0, 1 / 4), (1 / 2, 1 / 8))
+# This is added to the share of a pixel's light that comes from the drawn half of the chunks. So a pixel to which the
+# half contributes little counts little, because its error comes from other chunks.
+LIGHT_SHARE_OFFSET = 1e-3
+# If the light of a chunk in all views, at a radius, adds up to less than this, its errors are those of its neighbours.
 MIN_LIGHT_PIXELS = 1.0
-_COLUMNS = 3  # shares of chunks that are drawn at once, as the three channels of a picture
+_CHUNKS_PER_RENDER = 3  # the channels of a picture hold the light of one chunk each
 
 
 @torch.no_grad()
@@ -64,26 +66,26 @@ def measure_level_errors(
         (levels, chunks, len(ERROR_RADII)) float64: mean squared errors, relative to the area that `project_sphere`
         gives; 0 for the finest level.
     """
-    pool = _Pool.of(levels, fields or levels[0][:1], parts or [0] * len(spheres))
+    pool = _PooledChunks.of(levels, fields or levels[0][:1], parts or [0] * len(spheres))
     shape, rng = (len(levels), len(spheres), len(ERROR_RADII)), np.random.default_rng(seed)
     sums, areas, lights = np.zeros(shape), np.zeros(shape[1:]), np.zeros(shape[1:])
-    turns = zip(cameras, itertools.cycle(RESOLUTION_SHARES))
-    views = [resize_camera(camera, share) for camera, shares in turns for share in shares]
+    turns = zip(cameras, itertools.cycle(RESOLUTION_RATIOS))
+    views = [resize_camera(camera, ratio) for camera, ratios in turns for ratio in ratios]
     for number, camera in enumerate(views):
         progress(TaskEvent(f"measuring levels, view {number + 1}/{len(views)}", number / len(views)))
         in_half = rng.permutation(len(spheres)) % 2 == 0
         finest = pool.draw(np.zeros(len(spheres), np.int64), camera)
-        errors = []  # of each half at each level, divided by the share of the half
+        errors = []  # for each half and level, the error of each pixel divided by the half's share of its light
         for half in (in_half, ~in_half):
-            light = pool.draw_shares([half], camera)[..., 0] + MIN_SHARE
+            light = pool.draw_shares([half], camera)[..., 0] + LIGHT_SHARE_OFFSET
             renders = [pool.draw(half * level, camera) for level in range(1, len(levels))]
             errors.append([(rgb - finest).square().mean(dim=-1) / light for rgb in renders])
         projections = [project_sphere(center, radius, camera) for center, radius in spheres]
-        shown = [chunk for chunk, (_, area) in enumerate(projections) if area > 0]
-        for first in range(0, len(shown), _COLUMNS):
-            some = shown[first : first + _COLUMNS]
-            shares = pool.draw_shares([np.arange(len(spheres)) == chunk for chunk in some], camera)
-            for column, chunk in enumerate(some):
+        visible = [chunk for chunk, (_, area) in enumerate(projections) if area > 0]
+        for first in range(0, len(visible), _CHUNKS_PER_RENDER):
+            drawn = visible[first : first + _CHUNKS_PER_RENDER]
+            shares = pool.draw_shares([np.arange(len(spheres)) == chunk for chunk in drawn], camera)
+            for column, chunk in enumerate(drawn):
                 radius, area = projections[chunk]
                 weights = _node_weights(radius)
                 areas[chunk] += weights * area
@@ -91,18 +93,18 @@ def measure_level_errors(
                 for level, error in enumerate(errors[0 if in_half[chunk] else 1], 1):
                     sums[level, chunk] += weights * float((error * shares[..., column]).sum())
     # The sphere of a chunk may cover a picture that shows no Gaussian of it, such as one beside or behind the camera.
-    is_shown = lights >= MIN_LIGHT_PIXELS
-    return _fill_gaps(sums * is_shown, areas * is_shown)
+    is_visible = lights >= MIN_LIGHT_PIXELS
+    return _fill_gaps(sums * is_visible, areas * is_visible)
 
 
 @dataclass(frozen=True)
-class _Pool:
+class _PooledChunks:
     """The Gaussians of all chunks at all levels.
 
     Attributes:
-        model: the model of them all.
-        decoded: its view-independent part.
-        chunk_of, level_of: (N,) chunk and level of each.
+        model: one model of all N Gaussians.
+        decoded: the view-independent part of the model.
+        chunk_of, level_of: (N,) chunk and level of each Gaussian.
     """
 
     model: HybridModel | MergedModel
@@ -111,10 +113,12 @@ class _Pool:
     level_of: np.ndarray
 
     @classmethod
-    def of(cls, levels: Sequence[Sequence[HybridModel]], fields: Sequence[HybridModel], parts: Sequence[int]) -> _Pool:
+    def of(
+        cls, levels: Sequence[Sequence[HybridModel]], fields: Sequence[HybridModel], parts: Sequence[int]
+    ) -> _PooledChunks:
         """Pool the models of all chunks at each level, part by part."""
         keys = [(level, chunk) for level in range(len(levels)) for chunk in range(len(parts))]
-        keys.sort(key=lambda key: parts[key[1]])  # The sort is stable.
+        keys.sort(key=lambda key: parts[key[1]])  # stable, so that the order within a part stays
         models = [levels[level][chunk] for level, chunk in keys]
         names = [str(number) for number in range(len(fields))]
         model = join_parts(names, fields, models, [parts[chunk] for _, chunk in keys])
@@ -131,7 +135,9 @@ class _Pool:
         index = torch.from_numpy(np.flatnonzero(self.level_of == 0))
         none = np.zeros(len(sets[0]), bool)
         # A tensor of one element would index an array as an integer does.
-        members = np.stack([each[self.chunk_of[index.numpy()]] for each in (*sets, none, none)[:_COLUMNS]], axis=1)
+        members = np.stack(
+            [each[self.chunk_of[index.numpy()]] for each in (*sets, none, none)[:_CHUNKS_PER_RENDER]], axis=1
+        )
         model = self.model
         if isinstance(model, MergedModel):
             gaussians, frame = gather_geometry(model, camera, index, self.decoded), camera_frame(model, camera)

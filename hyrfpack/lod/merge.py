@@ -1,4 +1,4 @@
-"""Merges clusters of Gaussians: the merged ones keep mean, covariance, colour and covered area."""
+"""Merge clusters of Gaussians so that they keep their mean, covariance, colour and covered area."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _BISECTIONS = 40
 
 @dataclass(frozen=True)
 class Moments:
-    """Gaussians by their moments.
+    """Gaussians, described by their moments.
 
     Attributes:
         means: (N, 3) float64.
@@ -50,8 +50,8 @@ def merge_moments(gaussians: Moments, labels: np.ndarray, count: int) -> Moments
 
         mean = sum m_i p_i / sum m_i      covariance = sum m_i (C_i + (p_i - mean) (p_i - mean)^T) / sum m_i,
 
-    the mean colour, and the opacity sum m_i / area, at most MAX_OPACITY, so that it covers as much as they did. If all
-    opacities of a cluster are 0, its Gaussians have equal weights.
+    the mean colour, and the opacity sum m_i / area, at most MAX_OPACITY, so that it covers the same area as its
+    cluster. If all opacities of a cluster are 0, its Gaussians have equal weights.
 
     Args:
         gaussians: N Gaussians.
@@ -77,9 +77,9 @@ def merge_moments(gaussians: Moments, labels: np.ndarray, count: int) -> Moments
 
 @torch.no_grad()
 def merge_gaussians(model: HybridModel, geometry: Geometry, viewpoints: Sequence[Tensor], count: int) -> Gaussians:
-    """Merge the Gaussians of a model into `count` ones, which the fields of the model complete.
+    """Merge the Gaussians of a model into `count` Gaussians, whose other values come from the model's fields.
 
-    The fields give the shape and the rotation of a Gaussian at its place. So a merged Gaussian has the volume of the
+    The fields give the shape and the rotation of a Gaussian at its position. So a merged Gaussian has the volume of the
     covariance of its cluster, but the fields' shape. In a model with residuals it has the whole covariance, and the
     mean colour residuals of its cluster.
 
@@ -95,8 +95,8 @@ def merge_gaussians(model: HybridModel, geometry: Geometry, viewpoints: Sequence
         colors = np.concatenate((colors, residuals.double().numpy()), axis=1)
     cube = model.cube_coords(positions).double().numpy()
     labels = cluster(cube, count)
-    turns = rotation_matrices(torch.nn.functional.normalize(geometry.quats).double().numpy())
-    axes = turns * geometry.scales.double().numpy()[:, None, :]
+    rotations = rotation_matrices(torch.nn.functional.normalize(geometry.quats).double().numpy())
+    axes = rotations * geometry.scales.double().numpy()[:, None, :]
     covariances = axes @ axes.transpose(0, 2, 1)
     opacities = geometry.opacities.double().numpy()
     merged = merge_moments(Moments(positions.double().numpy(), covariances, opacities, colors), labels, count)

@@ -1,4 +1,4 @@
-"""Divides points into compact groups of bounded size or weight."""
+"""Divide points into compact groups of equal or bounded size."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def cluster(features: np.ndarray, count: int) -> np.ndarray:
 
 
 def _halve(points: np.ndarray, members: np.ndarray, left_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Divide points at the axis in which they spread most; equal coordinates keep their order."""
+    """Divide points along the axis of their largest extent; the first group has `left_count` of them."""
     values = points[members]
     axis = int(np.argmax(values.max(axis=0) - values.min(axis=0)))
     order = np.argsort(values[:, axis], kind="stable")

@@ -1,4 +1,4 @@
-"""Fits the Gaussians of a coarse level to renders of the finest level, at the resolution that it is seen at."""
+"""Fit the Gaussians of a coarse level to renders of the finest level, at the resolution at which views show it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from hyrfpack.scene import Camera
 
 # Learning rates at the start; they fall to zero along a cosine.
 LEARNING_RATES = {"color_logits": 0.1, "opacity_logits": 0.1, "scale_logits": 0.04}
-# The learning rate of positions, in mean distances between N Gaussians in the unit of the frame, N^(-1/3).
-POSITION_RATE = 0.04
+# The learning rate of positions, relative to N^(-1/3), about the mean distance of N Gaussians in local units.
+RELATIVE_POSITION_LEARNING_RATE = 0.04
 
 
 def refit_level(
@@ -47,7 +47,10 @@ def refit_level(
         targets = [render_view(finest, camera, decoded=decoded).rgb for camera in cameras]
     values, rates = [], []
     for part in filter(len, parts_of(level)):
-        for name, rate in {**LEARNING_RATES, "positions": POSITION_RATE * len(part) ** (-1 / 3)}.items():
+        for name, rate in {
+            **LEARNING_RATES,
+            "positions": RELATIVE_POSITION_LEARNING_RATE * len(part) ** (-1 / 3),
+        }.items():
             values.append(getattr(part.gaussians, name).requires_grad_())
             rates.append(rate)
     moments = [[torch.zeros_like(value) for value in values] for _ in range(2)]
@@ -60,7 +63,7 @@ def refit_level(
         loss = (render_view(level, cameras[number]).rgb - targets[number]).square().mean()
         if not loss.requires_grad:  # no Gaussian is in view
             continue
-        gradients = torch.autograd.grad(loss, values, materialize_grads=True)  # A part may be out of view.
+        gradients = torch.autograd.grad(loss, values, materialize_grads=True)  # a part may be out of view
         decay = (1 + math.cos(math.pi * step / steps)) / 2
         adam_step(values, gradients, *moments, step=step + 1, rate=[decay * rate for rate in rates])
     for value in values:

@@ -1,4 +1,4 @@
-"""Residuals in the chunks of a compact model: those of the file, exactly, and those of merged Gaussians."""
+"""Encode residuals in the chunks of a compact model: those of the file, exactly, and those of merged Gaussians."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class LayerResiduals:
         )
 
     def encode_values(self, values: np.ndarray, classes: np.ndarray) -> bytes:
-        """Encode other residuals (n, columns) with the steps of this layer; the Gaussians have the `classes` (n,)."""
+        """Encode new residuals (n, columns) of Gaussians with the `classes` (n,), with the steps of this layer."""
         numbers = values.astype(np.float64) if self.basis is None else split_colors(values, self.basis)
         symbols, start = [], 0
         for band, codes in zip(residual_bands(self.group, values.shape[1]), self.symbols.codes, strict=True):

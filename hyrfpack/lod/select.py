@@ -1,4 +1,4 @@
-"""Chooses the levels of detail of a scene's chunks for a view and a budget."""
+"""Choose the levels of detail of a scene's chunks for a view and a budget."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from hyrfpack.checks import check_type
 from hyrfpack.format.scene_manifest import Manifest
 from hyrfpack.scene import Camera
 
-# The error of a view without a chunk, relative to that with its coarsest level, and the least error of the pixels that
-# the chunk covers (docs/research/levels.md).
+# The error of leaving a chunk out, relative to the error of its coarsest level, and the smallest error of the pixels
+# that a left-out chunk covers (docs/research/levels.md).
 LEFT_OUT_RATIO = 3.0
 MIN_LEFT_OUT_MSE = 0.003
-# A chunk outside the picture has its coarsest level where the budget allows, because what it covers is an estimate.
+# The area that a chunk covers is an estimate. So leaving out a chunk that seems to be outside the picture has a small
+# error, and the chunk gets its coarsest level if the budget allows.
 UNSEEN_MSE = 1e-12
 
 
@@ -42,18 +43,20 @@ class LevelSelection:
 def select_levels(
     manifest: Manifest, camera: Camera, *, gaussians: int | None = None, bytes: int | None = None
 ) -> LevelSelection:
-    """Choose a level for each chunk, with the least predicted error of a view within a budget.
+    """Choose a level for each chunk so that the predicted error of a view is small within a budget.
 
     Every chunk is left out at first. Then the upgrades along the lower convex hull of each chunk's costs and errors
-    are taken by falling gain of error for their cost, as long as they fit (a greedy knapsack). The error exceeds
-    that of the best choice by less than the gain of the first upgrade that does not fit, `max_gap`: with a fraction of
-    this upgrade, the choice before it would be the optimum of the linear relaxation, which bounds all choices.
+    are taken in the order of falling error reduction per cost, as long as they fit (a greedy knapsack). The error
+    exceeds that of the best choice by less than the gain of the first upgrade that does not fit, `max_gap`: with a
+    fraction of this upgrade, the choice before it would be the optimum of the linear relaxation, which bounds all
+    choices.
 
     Args:
         manifest: the manifest of a scene folder.
         camera: the view, in world units.
-        gaussians: the most Gaussians; None for no limit.
-        bytes: the most bytes of files, with the shared files; None for no limit. Only one of both limits may be given.
+        gaussians: maximum number of Gaussians; None for no limit.
+        bytes: maximum size of the files, including the shared files; None for no limit. Only one of both limits may be
+            given.
 
     Raises:
         ValueError: both limits are given.
@@ -72,14 +75,18 @@ def select_levels(
     if gaussians is not None and bytes is not None:
         raise ValueError("both a number of Gaussians and a size limit the view; give one of them")
     count_bytes = bytes is not None
-    given = gaussians if bytes is None else bytes
-    limit = math.inf if given is None else given
-    base = manifest.shared_bytes if count_bytes else 0
-    costs = [[*(x.bytes if count_bytes else x.gaussians for x in chunk.levels), 0] for chunk in manifest.chunks]
+    budget = gaussians if bytes is None else bytes
+    limit = math.inf if budget is None else budget
+    base_cost = manifest.shared_bytes if count_bytes else 0
+    costs = [
+        [*(level.bytes if count_bytes else level.gaussians for level in chunk.levels), 0] for chunk in manifest.chunks
+    ]
     errors = [[*own, left_out + UNSEEN_MSE] for *own, left_out in predict_errors(manifest, camera)]
-    chosen, max_gap = choose_levels(costs, errors, limit - base)
-    levels = [level if level < len(x.levels) else None for x, level in zip(manifest.chunks, chosen, strict=True)]
-    files = [x.levels[level] for x, level in zip(manifest.chunks, levels, strict=True) if level is not None]
+    chosen, max_gap = choose_levels(costs, errors, limit - base_cost)
+    levels = [
+        level if level < len(chunk.levels) else None for chunk, level in zip(manifest.chunks, chosen, strict=True)
+    ]
+    files = [chunk.levels[level] for chunk, level in zip(manifest.chunks, levels, strict=True) if level is not None]
     return LevelSelection(
         levels,
         sum(file.gaussians for file in files),
@@ -153,7 +160,8 @@ def project_sphere(center: Sequence[float], radius: float, camera: Camera) -> tu
     """Return the radius in pixels of a sphere's projection, and its area within the picture in square pixels.
 
     The radius is f r / max(distance, r) with the focal length f. The area is that of the disc, times the share of its
-    bounding square that lies in the picture. A camera inside the sphere sees it everywhere; behind the camera it is 0.
+    bounding square that lies in the picture. If the camera is inside the sphere, the area is the whole picture; if the
+    sphere is wholly behind the camera, it is 0.
     """
     x, y, z = (camera.rotation @ (np.asarray(center) - camera.position)).tolist()
     distance, focal = math.hypot(x, y, z), math.sqrt(camera.fx * camera.fy)

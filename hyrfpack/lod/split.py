@@ -1,4 +1,4 @@
-"""Splits a model into a scene folder: chunks at several levels of detail, and a manifest with their errors."""
+"""Split a model into a scene folder: chunks at several levels of detail, and a manifest with their errors."""
 
 from __future__ import annotations
 
@@ -56,22 +56,23 @@ from hyrfpack.scene import Camera, Scene, evenly_spaced
 _LOG = logging.getLogger(__name__)
 
 SHARED_NAME = "shared.hyrf"
-LEVEL_RATIO = 4  # A level has as many times the Gaussians of the next coarser one, as pictures of half the size.
+# The next coarser level has fewer Gaussians by this ratio, and is for pictures with as many times fewer pixels.
+GAUSSIANS_RATIO_OF_LEVELS = 4
 MERGE_VIEWPOINTS = 8
-REFIT_BETWEEN = 3  # views between cameras, for each view at a camera
-# Of each part; views of all parts together are limited, because they take memory and time.
-REFIT_CAMERAS, MAX_REFIT_CAMERAS = 12, 48
-MEASURED_VIEWS, MAX_MEASURED_VIEWS = 24, 64
-_SEED_STEP = 1000  # keeps the views that levels are fitted at from those that they are measured at
-MAX_BOX_GROWTH = 1e-5  # of a side, relative to the diagonal
+REFIT_VIEWS_BETWEEN_CAMERAS = 3  # for each view at a camera, this many views between it and its neighbours
+# Limits for each part and for all parts together, because views take memory and time.
+REFIT_CAMERAS_PER_PART, MAX_REFIT_CAMERAS = 12, 48
+MEASURED_VIEWS_PER_PART, MAX_MEASURED_VIEWS = 24, 64
+_SEED_STEP = 1000  # so that levels are not fitted to the views at which their errors are measured
+MAX_BOX_GROWTH_DIAGONAL_RATIO = 1e-5
 _MIN_BOX_SIZE = 1e-30
-_SIGMAS = 3.0
-_REFIT_SHARE, _MEASURE_SHARE = 0.6, 0.3  # of the progress
+_BOX_MARGIN_SIGMAS = 3.0
+_REFIT_PROGRESS_SHARE, _MEASURE_PROGRESS_SHARE = 0.6, 0.3
 
 
 @dataclass(frozen=True)
 class SplitReport:
-    """What `split_model` has written.
+    """The files that `split_model` has written.
 
     Attributes:
         folder: path of the folder.
@@ -120,7 +121,7 @@ def split_model(
         data: photos of the scene, whose training cameras are used. A compressed file keeps few cameras, so errors of
             its levels fit views near the photos less well.
         overwrite: replace a scene in the folder. If False, existing files are an error.
-        context: how progress is shown.
+        context: progress.
 
     Raises:
         HyrfError: the file cannot be read or holds no Gaussian, or the folder cannot be written or would be too large.
@@ -138,14 +139,16 @@ def split_model(
     if data is not None:
         check_type("data", data, Scene)
     if is_scene(source):
-        raise HyrfError(f"{source}: this is a scene of several files already", fix="split the model that it came from")
+        raise HyrfError(
+            f"{source}: this is a scene of several files already", fix="split the model from which it was made"
+        )
     path, target = find_model(source), Path(target)
     shared_names = _name_shared_files(path)
     Outputs(path, scene=data, overwrite=True).folder(target, [MANIFEST_NAME, *shared_names])
     with exclusive_folder(target), context.open_progress("split") as progress:
         Outputs(path, scene=data, overwrite=overwrite).folder(target, [MANIFEST_NAME, *shared_names])
         data = place_photos(describe_file(path), data)
-        files, manifest = _split(path, shared_names, name_model(source), config, data, progress)
+        files, manifest = _encode_scene(path, shared_names, name_model(source), config, data, progress)
         Outputs(path, scene=data, overwrite=overwrite).folder(target, files)
         _check_manifest(manifest, target / MANIFEST_NAME)
         _write_folder(target, files, manifest, overwrite)
@@ -168,11 +171,11 @@ class _Part:
     """A part of the scene that is split.
 
     Attributes:
-        name: its name.
-        encoder: the encoder of its chunks.
-        geometry: geometry of its Gaussians.
-        groups: the Gaussians of each of its chunks, in the order of the chunk's file.
-        finest: the bytes of each of its chunks at the finest level.
+        name: name of the part.
+        encoder: the encoder of the part's chunks.
+        geometry: geometry of the part's Gaussians.
+        groups: indices of the Gaussians of each chunk, in the order of the chunk's file.
+        finest: bytes of each chunk at the finest level.
     """
 
     name: str
@@ -182,8 +185,8 @@ class _Part:
     finest: list[bytes]
 
     @classmethod
-    def of(cls, name: str, encoder: ChunkEncoder, chunk_gaussians: int) -> _Part:
-        """Divide a part into chunks."""
+    def divide(cls, name: str, encoder: ChunkEncoder, chunk_gaussians: int) -> _Part:
+        """Divide the Gaussians of a part into chunks, and encode the finest level of each."""
         model = encoder.model
         cube = model.cube_coords(model.gaussians.positions.detach().double()).numpy()
         encoded = [encoder.encode_subset(group) for group in partition(cube, chunk_gaussians) if len(group)]
@@ -192,7 +195,7 @@ class _Part:
 
     @property
     def model(self) -> HybridModel:
-        """The model of all its Gaussians."""
+        """Return the model of all Gaussians of the part."""
         return self.encoder.model
 
 
@@ -203,32 +206,36 @@ def _name_shared_files(path: Path) -> list[str]:
     return [SHARED_NAME] if count == 1 else [f"shared-{number:02d}.hyrf" for number in range(count)]
 
 
-def _split(
+def _encode_scene(
     path: Path, shared_names: Sequence[str], name: str, config: SplitConfig, photos: Scene | None, progress: Progress
 ) -> tuple[dict[str, bytes], Manifest]:
     """Return the files of the folder by name, without the manifest, and the manifest."""
     progress(TaskEvent("reading the model", 0.0))
     facts = describe_file(path)
-    whole, parts = _read_parts(path, shared_names, config.chunk_gaussians)
+    model, parts = _read_parts(path, shared_names, config.chunk_gaussians)
     cameras = [view.camera for view in photos.train] if photos and photos.train else _list_cameras(facts)
-    owners = [number for number, part in enumerate(parts) for _ in part.groups]
+    part_numbers = [number for number, part in enumerate(parts) for _ in part.groups]
     encoded = [[data] for part in parts for data in part.finest]
     models = [[part.model.subset(torch.from_numpy(group)) for part in parts for group in part.groups]]
     boxes = [box for part in parts for box in _measure_boxes(part)]
     for level in range(1, config.levels):
         share = (level - 1) / max(config.levels - 1, 1)
-        stage = part_of_progress(progress, _REFIT_SHARE * share, _REFIT_SHARE * (share + 1 / (config.levels - 1)))
+        stage = part_of_progress(
+            progress, _REFIT_PROGRESS_SHARE * share, _REFIT_PROGRESS_SHARE * (share + 1 / (config.levels - 1))
+        )
         models.append([])
-        for number, coarse in enumerate(_make_level(parts, owners, whole, cameras, level, config, stage)):
-            encoder = parts[owners[number]].encoder
+        for number, coarse in enumerate(_make_level(parts, part_numbers, model, cameras, level, config, stage)):
+            encoder = parts[part_numbers[number]].encoder
             data = encoder.encode_gaussians(coarse)
             encoded[number].append(data)
             models[-1].append(_decode(data, encoder))
     spheres = [(chunk.center, chunk.radius) for chunk in (Chunk(low, high, ()) for low, high in boxes)]
-    stage = part_of_progress(progress, _REFIT_SHARE, _REFIT_SHARE + _MEASURE_SHARE)
-    count = min(MEASURED_VIEWS * len(parts), MAX_MEASURED_VIEWS)
+    stage = part_of_progress(progress, _REFIT_PROGRESS_SHARE, _REFIT_PROGRESS_SHARE + _MEASURE_PROGRESS_SHARE)
+    count = min(MEASURED_VIEWS_PER_PART * len(parts), MAX_MEASURED_VIEWS)
     views = sample_views(cameras, count, config.seed + 1)[1] if config.levels > 1 else []
-    errors = measure_level_errors(models, spheres, views, [part.model for part in parts], owners, config.seed, stage)
+    errors = measure_level_errors(
+        models, spheres, views, [part.model for part in parts], part_numbers, config.seed, stage
+    )
     files = {part.encoder.shared_name: part.encoder.shared_bytes for part in parts}
     chunks = []
     for number, (low, high) in enumerate(boxes):
@@ -238,7 +245,7 @@ def _split(
             files[file] = data
             stated = tuple(float(f"{error:.4g}") for error in errors[level, number])
             levels.append(ChunkLevel(file, len(data), _checksum(data), len(models[level][number]), stated))
-        chunks.append(Chunk(low, high, tuple(levels), owners[number]))
+        chunks.append(Chunk(low, high, tuple(levels), part_numbers[number]))
     return files, _make_manifest(parts, chunks, Capture(facts, photos), name, config)
 
 
@@ -257,7 +264,7 @@ def _read_parts(
         models, parts = parts_of(decoded), []
         for number, (name, part) in enumerate(list_parts(container)):
             encoder = ChunkEncoder(part, models[number], shared_names[number])
-            parts.append(_Part.of(name, encoder, chunk_gaussians))
+            parts.append(_Part.divide(name, encoder, chunk_gaussians))
     return decoded, parts
 
 
@@ -272,32 +279,44 @@ def _list_cameras(facts: dict) -> list[Camera]:
 
 def _make_level(
     parts: Sequence[_Part],
-    owners: Sequence[int],
-    whole: HybridModel | MergedModel,
+    part_numbers: Sequence[int],
+    finest: HybridModel | MergedModel,
     cameras: Sequence[Camera],
     level: int,
     config: SplitConfig,
     progress: Progress,
 ) -> list[HybridModel]:
-    """Return the model of each chunk at a coarse level."""
-    places = [camera.position for camera in sample_views(cameras, MERGE_VIEWPOINTS, config.seed)[0]]
+    """Merge the Gaussians of each chunk to a coarse level, fit them, and return the model of each chunk.
+
+    Args:
+        parts: parts of the scene.
+        part_numbers: number of the part of each chunk.
+        finest: the model of the finest level of all parts.
+        cameras: cameras of the scene.
+        level: number of the level, at least 1.
+        config: settings of the split.
+        progress: called with `TaskEvent`s.
+    """
+    world_viewpoints = [camera.position for camera in sample_views(cameras, MERGE_VIEWPOINTS, config.seed)[0]]
     merged = []
     for part in parts:
         model, frame = part.model, part.model.config.frame
-        viewpoints = [tensor_like(frame.to_local(place).tolist(), model.gaussians.positions) for place in places]
+        viewpoints = [
+            tensor_like(frame.to_local(viewpoint).tolist(), model.gaussians.positions) for viewpoint in world_viewpoints
+        ]
         for group in part.groups:
             index = torch.from_numpy(group)
-            count = max(1, len(group) // LEVEL_RATIO**level)
+            count = max(1, len(group) // GAUSSIANS_RATIO_OF_LEVELS**level)
             gaussians = merge_gaussians(model.subset(index), part.geometry[index], viewpoints, count)
             merged.append(model.with_gaussians(gaussians))
-    joined = join_parts([part.name for part in parts], [part.model for part in parts], merged, owners)
-    share = LEVEL_RATIO ** (-level / 2)
-    count = min(REFIT_CAMERAS * len(parts), MAX_REFIT_CAMERAS)
-    views = [resize_camera(camera, share) for camera in _refit_views(cameras, count, config.seed)]
-    refit_level(joined, whole, views, config.refit_steps * len(parts), config.seed, progress)
+    joined = join_parts([part.name for part in parts], [part.model for part in parts], merged, part_numbers)
+    resolution_ratio = GAUSSIANS_RATIO_OF_LEVELS ** (-level / 2)
+    count = min(REFIT_CAMERAS_PER_PART * len(parts), MAX_REFIT_CAMERAS)
+    views = [resize_camera(camera, resolution_ratio) for camera in _refit_views(cameras, count, config.seed)]
+    refit_level(joined, finest, views, config.refit_steps * len(parts), config.seed, progress)
     fitted = []
     for number, model in enumerate(parts_of(joined)):
-        counts = [len(chunk) for chunk, owner in zip(merged, owners, strict=True) if owner == number]
+        counts = [len(chunk) for chunk, part in zip(merged, part_numbers, strict=True) if part == number]
         fitted += [model.subset(index) for index in torch.arange(len(model)).split(counts)]
     return fitted
 
@@ -305,7 +324,9 @@ def _make_level(
 def _refit_views(cameras: Sequence[Camera], count: int, seed: int) -> list[Camera]:
     """Return views at `count` cameras, and for each of them several between it and its neighbours."""
     at, between = sample_views(cameras, count, seed)
-    more = [sample_views(cameras, count, seed + _SEED_STEP * number)[1] for number in range(1, REFIT_BETWEEN)]
+    more = [
+        sample_views(cameras, count, seed + _SEED_STEP * number)[1] for number in range(1, REFIT_VIEWS_BETWEEN_CAMERAS)
+    ]
     return [*at, *between, *(view for views in more for view in views)]
 
 
@@ -320,26 +341,27 @@ def _measure_boxes(part: _Part) -> list[tuple[tuple[float, float, float], tuple[
     """Return the corners of the box of each chunk of a part in world units, three standard deviations included."""
     frame = part.model.config.frame
     means = frame.to_world(part.model.gaussians.positions.numpy())
-    reach = _SIGMAS * frame.scale * part.geometry.scales.amax(dim=1).double().numpy()
+    radii = _BOX_MARGIN_SIGMAS * frame.scale * part.geometry.scales.amax(dim=1).double().numpy()
     boxes = []
     for group in part.groups:
-        low = (means[group] - reach[group, None]).min(axis=0)
-        high = (means[group] + reach[group, None]).max(axis=0)
+        low = (means[group] - radii[group, None]).min(axis=0)
+        high = (means[group] + radii[group, None]).max(axis=0)
         boxes.append(_round_outwards(low, high))
     return boxes
 
 
 def _round_outwards(low: np.ndarray, high: np.ndarray) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Round the corners of a box to few decimal places, so that the box grows by at most MAX_BOX_GROWTH of its size.
+    """Round the corners of a box outwards to few decimal places.
 
-    The places depend on the size of the box and not on the coordinates, which may be large map coordinates.
+    Each side grows by at most MAX_BOX_GROWTH_DIAGONAL_RATIO of the diagonal. The number of decimal places depends on
+    the diagonal and not on the coordinates, which may be large map coordinates.
     """
     size = float(np.linalg.norm(high - low))
-    places = math.ceil(-math.log10(MAX_BOX_GROWTH * max(size, _MIN_BOX_SIZE)))
+    decimals = math.ceil(-math.log10(MAX_BOX_GROWTH_DIAGONAL_RATIO * max(size, _MIN_BOX_SIZE)))
 
     def round_down(value: float) -> float:
-        rounded = round(value, places)
-        return rounded if rounded <= value else min(round(rounded - 10.0**-places, places), value)
+        rounded = round(value, decimals)
+        return rounded if rounded <= value else min(round(rounded - 10.0**-decimals, decimals), value)
 
     lows, highs = map(round_down, low.tolist()), map(round_down, (-high).tolist())
     (a, b, c), (d, e, f) = lows, highs

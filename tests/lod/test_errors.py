@@ -37,7 +37,7 @@ def manifest_of(measured: np.ndarray, boxes=((LOW, HIGH), (LOW, HIGH))) -> Manif
 
 
 def test_predictions_add_up_to_the_error_of_the_measured_views(monkeypatch):
-    monkeypatch.setattr(errors, "RESOLUTION_SHARES", ((1.0,),))
+    monkeypatch.setattr(errors, "RESOLUTION_RATIOS", ((1.0,),))
     levels, cameras = make_levels(), ring(3, radius=4.0, width=48, height=48)
     fine, coarse = (join_chunks(level[0], level) for level in levels)
     actual = [float((render_view(fine, c).rgb - render_view(coarse, c).rgb).square().mean()) for c in cameras]
@@ -52,7 +52,7 @@ def test_predictions_add_up_to_the_error_of_the_measured_views(monkeypatch):
 
 def test_chunks_of_two_parts_have_the_errors_of_chunks_of_one(monkeypatch):
     """So each part is seen among the Gaussians of the other one."""
-    monkeypatch.setattr(errors, "RESOLUTION_SHARES", ((1.0,),))
+    monkeypatch.setattr(errors, "RESOLUTION_RATIOS", ((1.0,),))
     levels, cameras = make_levels(), ring(2, radius=4.0, width=48, height=48)
     spheres = [(Chunk(LOW, HIGH, ()).center, Chunk(LOW, HIGH, ()).radius)] * 2
 

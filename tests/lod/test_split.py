@@ -48,8 +48,8 @@ def folder(tmp_path_factory) -> Path:
     """Return a scene folder of four chunks at two levels."""
     path = tmp_path_factory.mktemp("split") / "demo-scene"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(split, "REFIT_CAMERAS", 1)
-        patch.setattr(split, "MEASURED_VIEWS", 2)
+        patch.setattr(split, "REFIT_CAMERAS_PER_PART", 1)
+        patch.setattr(split, "MEASURED_VIEWS_PER_PART", 2)
         split_model(
             COMPACT_FILE, path, SplitConfig(chunk_gaussians=400, levels=2, refit_steps=3), context=QUIET_CONTEXT
         )
@@ -126,7 +126,7 @@ def test_chunks_keep_residuals_exactly_and_merged_gaussians_have_their_own(tmp_p
     if profile == "raw":
         source = tmp_path / "raw.hyrf"
         save_model(load_model(GOLDEN_FOLDER / "v1.6_compact_residuals.hyrf"), source)
-    monkeypatch.setattr(split, "MEASURED_VIEWS", 1)
+    monkeypatch.setattr(split, "MEASURED_VIEWS_PER_PART", 1)
     split_model(source, tmp_path / "scene", SplitConfig(levels=2, refit_steps=0), context=QUIET_CONTEXT)
 
     exact = ("positions", "shape_residuals", "color_residuals")
@@ -195,8 +195,8 @@ def test_boxes_of_a_small_object_in_map_coordinates_keep_its_size(tmp_path):
 
 
 def test_a_model_of_one_gaussian_can_be_split(tmp_path, monkeypatch):
-    monkeypatch.setattr(split, "MEASURED_VIEWS", 1)
-    monkeypatch.setattr(split, "REFIT_CAMERAS", 1)
+    monkeypatch.setattr(split, "MEASURED_VIEWS_PER_PART", 1)
+    monkeypatch.setattr(split, "REFIT_CAMERAS_PER_PART", 1)
 
     scene = split_around(tmp_path, np.zeros((1, 3)), Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0)), levels=2)
 
@@ -285,7 +285,7 @@ def test_levels_are_fitted_and_measured_at_the_cameras_of_the_photos(tmp_path, m
         return np.zeros((len(levels), len(spheres), len(ERROR_RADII)))
 
     monkeypatch.setattr(split, "measure_level_errors", record)
-    monkeypatch.setattr(split, "MEASURED_VIEWS", 3)
+    monkeypatch.setattr(split, "MEASURED_VIEWS_PER_PART", 3)
     config = SplitConfig(chunk_gaussians=400, levels=2, refit_steps=1)
     split_model(COMPACT_FILE, tmp_path / "scene", config, data=scene, context=QUIET_CONTEXT)
 

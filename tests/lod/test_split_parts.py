@@ -58,8 +58,8 @@ def folder(merged_file, tmp_path_factory) -> Path:
     """Return a scene folder of two parts, each of two chunks at two levels."""
     path = tmp_path_factory.mktemp("split") / "both-scene"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(split, "REFIT_CAMERAS", 1)
-        patch.setattr(split, "MEASURED_VIEWS", 1)
+        patch.setattr(split, "REFIT_CAMERAS_PER_PART", 1)
+        patch.setattr(split, "MEASURED_VIEWS_PER_PART", 1)
         split_model(merged_file, path, SplitConfig(chunk_gaussians=800, levels=2, refit_steps=1), context=QUIET_CONTEXT)
     return path
 

@@ -56,7 +56,7 @@ def parts_folder(tmp_path_factory) -> Path:
     models = [(f"part {seed}", encode_model(random_model(GAUSSIANS_PER_PART, seed))) for seed in range(PART_COUNT)]
     (path / "all.hyrf").write_bytes(encode_parts(models))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(split, "MEASURED_VIEWS", 1)
+        patch.setattr(split, "MEASURED_VIEWS_PER_PART", 1)
         config = SplitConfig(chunk_gaussians=CHUNK_GAUSSIANS, levels=2, refit_steps=0)
         split_model(path / "all.hyrf", path / "scene", config, context=RunContext(progress=None))
     return path / "scene"

@@ -142,8 +142,8 @@ def levels_folder(tmp_path_factory) -> hyrfpack.SceneFolder:
     """Return a scene folder of four chunks at two levels."""
     path = tmp_path_factory.mktemp("stream") / "demo-scene"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(split, "REFIT_CAMERAS", 1)
-        patch.setattr(split, "MEASURED_VIEWS", 2)
+        patch.setattr(split, "REFIT_CAMERAS_PER_PART", 1)
+        patch.setattr(split, "MEASURED_VIEWS_PER_PART", 2)
         config = SplitConfig(chunk_gaussians=400, levels=2, refit_steps=3)
         split_model(TRAINED_FILE, path, config, context=RunContext(progress=None))
     return hyrfpack.SceneFolder(path)
@@ -157,8 +157,8 @@ def parts_folder(tmp_path_factory) -> hyrfpack.SceneFolder:
     (path / "other.hyrf").write_bytes(TRAINED_FILE.read_bytes())
     hyrfpack.merge_models([TRAINED_FILE, path / "other.hyrf"], path / "both.hyrf", moves)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(split, "REFIT_CAMERAS", 1)
-        patch.setattr(split, "MEASURED_VIEWS", 1)
+        patch.setattr(split, "REFIT_CAMERAS_PER_PART", 1)
+        patch.setattr(split, "MEASURED_VIEWS_PER_PART", 1)
         config = SplitConfig(chunk_gaussians=800, levels=2, refit_steps=3)
         split_model(path / "both.hyrf", path / "scene", config, context=RunContext(progress=None))
     return hyrfpack.SceneFolder(path / "scene")
@@ -266,7 +266,7 @@ def split_parts(path: Path, models: list[HybridModel], config: SplitConfig) -> h
     parts = [(f"part {number}", encode_model(model)) for number, model in enumerate(models)]
     (path / "all.hyrf").write_bytes(encode_parts(parts))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(split, "MEASURED_VIEWS", 1)
+        patch.setattr(split, "MEASURED_VIEWS_PER_PART", 1)
         split_model(path / "all.hyrf", path / "scene", config, context=RunContext(progress=None))
     return hyrfpack.SceneFolder(path / "scene")
 
