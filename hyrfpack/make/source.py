@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hyrfpack.data import load_scene
 from hyrfpack.data.archive import is_archive, unpack
-from hyrfpack.data.folder import explain_missing_path, list_photos
+from hyrfpack.data.folder import explain_missing_path, list_photos, list_pictures
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
 from hyrfpack.make.held_out import choose_inner_view
 from hyrfpack.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs, StrPath
@@ -107,9 +107,10 @@ class Source:
         """Return the files from which poses are estimated: photos and their masks, or a video."""
         if self.path.is_file():
             return [self.path]
-        masks = [self.path / "masks", self.path / "mask"]
-        masks += [self.path.parent / "masks"] if self.path.name == "images" else []
-        return [*list_photos(self.path), *(p for folder in masks for p in sorted(folder.rglob("*")) if p.is_file())]
+        mask_folders = [self.path / "masks", self.path / "mask"]
+        mask_folders += [self.path.parent / "masks"] if self.path.name == "images" else []
+        masks = [mask for folder in mask_folders if folder.is_dir() for mask in list_pictures(folder)]
+        return [*list_photos(self.path), *masks]
 
     def output_rules(self, overwrite: bool) -> list[Outputs]:
         """Return the rules that protect the source from being overwritten; all of them apply."""

@@ -26,3 +26,17 @@ def test_poses_of_other_photos_are_refused_unless_they_may_be_replaced(photos, p
     auto_pose(photos, tmp_path / "run", overwrite=True)
     auto_pose(photos, tmp_path / "run", resume=True)
     assert poses == [photos, photos]
+
+
+def test_poses_depend_on_masks_but_not_on_other_files_beside_them(photos, poses, tmp_path):
+    (photos / "masks").mkdir()
+    shutil.copy(next(photos.glob("*.png")), photos / "masks")
+    auto_pose(photos, tmp_path / "run")
+    (photos / "masks" / ".DS_Store").write_bytes(b"written by a file manager")
+    (photos / "masks" / "Thumbs.db").write_bytes(b"written by a file manager")
+    auto_pose(photos, tmp_path / "run", resume=True)
+
+    shutil.copy(sorted(photos.glob("*.png"))[1], photos / "masks")
+
+    with pytest.raises(HyrfError, match="these poses were estimated from other photos"):
+        auto_pose(photos, tmp_path / "run", resume=True)
