@@ -127,7 +127,7 @@ def run_training_stage(
             at_most = "at most " if measures_length(scene, config) else ""
             _LOG.info(
                 f"training: {at_most}{format_count(plan.steps, 'step')} on {format_count(len(scene.train), 'photo')}, "
-                f"{len(scene.test)} held out, on {describe_device(context.choose_device())}"
+                f"{len(scene.test)} held out; on {describe_device(context.choose_device())}"
             )
             resume = resuming and is_begun(run)
             if not resume:
