@@ -529,7 +529,12 @@ class Trainer:
             HyrfError: the file cannot be written, or exists and `overwrite` is False.
         """
         observed = self.ranks.all_gather(_on_cpu(self.strategy.state_dict()))
-        self.ranks.run_on_main(lambda: self._write_checkpoint(path, observed, overwrite))
+
+        def write() -> None:
+            self._write_checkpoint(path, observed, overwrite)
+            self.saved = self.step  # Before rank 0 hears from the others, so that errors name the checkpoint.
+
+        self.ranks.run_on_main(write)
         self.saved = self.step
 
     def _write_checkpoint(self, path: Path, observed: list[dict[str, Tensor]], overwrite: bool) -> None:
