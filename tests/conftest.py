@@ -47,6 +47,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
     compile_kernels_once()
 
+from hang_watchdog import HangWatchdog
 from layers import forbid_training_and_processes, layer_of
 from ops.device import needs_triton  # this import asks for Triton, which reads the environment set above
 from property_tests import use_quick_profile
@@ -56,7 +57,8 @@ from hyrfpack.evaluate.figures import figure_to_svg
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Draw fewer examples of property tests where acceptance tests are left out, as in `make test`."""
+    """End tests that hang. Draw fewer examples of property tests without acceptance tests, as in `make test`."""
+    config.pluginmanager.register(HangWatchdog())
     if "not acceptance" in config.option.markexpr:
         use_quick_profile()
 

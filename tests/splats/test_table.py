@@ -96,7 +96,7 @@ def test_the_docs_list_the_suffixes_of_the_table():
     from hyrfpack.export.kinds import EXPORT_ENDINGS
 
     assert suffixes_in_docs("export.md", "| ending |", "\n\n") == set(EXPORT_ENDINGS) > set(FORMATS)
-    assert suffixes_in_docs("import.md", "| read |", "\n\n") == {
+    assert suffixes_in_docs("import.md", "| readable format |", "\n\n") == {
         row.ending for row in FORMATS.values() if row.is_readable
     }
 
