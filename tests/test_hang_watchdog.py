@@ -6,13 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-CONFTEST = """
+CONFTEST_SOURCE = """
 from hang_watchdog import HangWatchdog
 
 def pytest_configure(config):
     config.pluginmanager.register(HangWatchdog(max_seconds=0.3, renewal_seconds=0.1))
 """
-TESTS = """
+TEST_MODULE_SOURCE = """
 import time
 
 def test_quick():
@@ -24,8 +24,8 @@ def test_slow():
 
 
 def test_a_hanging_test_ends_its_process_and_is_named(tmp_path):
-    (tmp_path / "conftest.py").write_text(CONFTEST)
-    (tmp_path / "test_some.py").write_text(TESTS)
+    (tmp_path / "conftest.py").write_text(CONFTEST_SOURCE)
+    (tmp_path / "test_some.py").write_text(TEST_MODULE_SOURCE)
     (tmp_path / "pytest.ini").write_text(f"[pytest]\npythonpath = {Path(__file__).parent}\n")
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-p", "no:xdist", tmp_path]
 

@@ -96,7 +96,7 @@ def calibrate(
     if prune:
         errors = PruningErrors(model, geometry, references, distortion)
         sensitivity = _match_measurements(sensitivity, errors, distortion, part_of_progress(progress, 0.0, 0.2))
-        del errors  # and with it the geometry of all Gaussians, once only that of the others is needed
+        del errors  # It refers to the geometry of all Gaussians, whose memory is free once they are pruned.
     kept = indices_to_keep(sensitivity, distortion_per_number(model, distortion), prune)
     index = torch.as_tensor(kept, device=outputs.device)
     pruned, outputs, geometry = model.subset(index), outputs[index], geometry[index]

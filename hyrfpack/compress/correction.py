@@ -19,9 +19,10 @@ from hyrfpack.format.sections import (
 
 # A part that takes 1.4 times its share of the error costs less than 1 % more bits than the best split.
 PREDICTION_TOLERANCE_RATIO = 1.4
-# Positions have steps of powers of two, so their error jumps where a class gets another step. A factor between two such
-# steps is not searched for: half of the predicted error is close enough.
-MIN_POSITION_ERROR_RATIO = 0.5
+# Ratios of measured to predicted error that are close enough, where they are lower than 1 / PREDICTION_TOLERANCE_RATIO.
+# Positions have steps of powers of two, so their error jumps where a class gets another step, and no factor may give an
+# error between the two.
+MIN_ERROR_RATIOS: dict[Part, float] = {(POSITIONS,): 0.5}
 MAX_CORRECTION_RATIO = 64.0
 # Factors to measure first: medians of those found for trained models of twelve captures.
 TYPICAL_FACTORS: dict[Part, float] = {
@@ -88,11 +89,13 @@ class SensitivityCorrection:
         """Start from typical factors for `parts`, the groups of sections that share a factor."""
         self._sensitivity = sensitivity
         self._factors = {
-            part: CorrectionFactor(CORRECTION_EXPONENTS.get(part, 1.0), TYPICAL_FACTORS.get(part, 1.0))
+            part: CorrectionFactor(
+                CORRECTION_EXPONENTS.get(part, 1.0),
+                TYPICAL_FACTORS.get(part, 1.0),
+                min_ratio=MIN_ERROR_RATIOS.get(part, 1 / PREDICTION_TOLERANCE_RATIO),
+            )
             for part in parts
         }
-        if (POSITIONS,) in self._factors:
-            self._factors[POSITIONS,].min_ratio = MIN_POSITION_ERROR_RATIO
 
     @property
     def remaining(self) -> list[Part]:

@@ -242,7 +242,7 @@ def _replace_arrays(model: HybridModel, arrays: dict[str, np.ndarray]) -> Hybrid
 
 
 def decode_changed(model: HybridModel, part: Part, geometry: Geometry, geometry_outputs: torch.Tensor) -> Decoded:
-    """Decode a model after one part changed, apart from what depends on neither this part nor the view.
+    """Decode a model after one part changed, without evaluating again what does not depend on this part.
 
     Args:
         model: the model after the change.

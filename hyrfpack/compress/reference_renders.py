@@ -96,7 +96,7 @@ class ReferenceRenders:
         """
         decoded = model.decode() if decoded is None else decoded
         count = len(self.views)
-        rough = range(count)[count // 4 :: max(1, count // 2)]  # from the middle of each half
+        first_measured = range(count)[count // 4 :: max(1, count // 2)]  # from the middle of each half
 
         def error(index: int, rgb: Tensor) -> float:
             return float((rgb - self.pictures[index]).square().mean())
@@ -106,12 +106,12 @@ class ReferenceRenders:
 
         if predicted is None:
             return float(np.median(measure(range(count))))
-        errors = measure(rough)
+        errors = measure(first_measured)
         if min(errors) > predicted * MAX_ROUGH_ERROR_RATIO:
             return min(errors)
         if max(errors) < predicted / MAX_ROUGH_ERROR_RATIO:
             return max(errors)
-        return float(np.median(errors + measure([index for index in range(count) if index not in rough])))
+        return float(np.median(errors + measure([index for index in range(count) if index not in first_measured])))
 
 
 def _map_renders(

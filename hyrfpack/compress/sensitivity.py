@@ -389,10 +389,10 @@ def _expected_light(
 
     def measure_light_and_area(rows: slice) -> torch.Tensor:
         sides = geometry.scales[rows].double().sort(dim=1).values
-        area, some = sides[:, 1] * sides[:, 2], positions[rows].double()
+        area, points = sides[:, 1] * sides[:, 2], positions[rows].double()
         total = torch.zeros_like(area)
         for place, share in zip(places, shares, strict=True):
-            distance = torch.linalg.vector_norm(some - place, dim=1).clamp_min(MIN_CAMERA_DISTANCE_LOCAL)
+            distance = torch.linalg.vector_norm(points - place, dim=1).clamp_min(MIN_CAMERA_DISTANCE_LOCAL)
             total += (area * share / distance**2).clamp_max(1)
         return torch.stack((total * geometry.opacities[rows].double() ** 2, area), dim=1)
 

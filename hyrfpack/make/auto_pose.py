@@ -16,9 +16,8 @@ from hyrfpack.make.stage_cache import interruptible
 from hyrfpack.make.stages import SCENE_FOLDER, is_posed
 from hyrfpack.make.state import files_digest
 
-SOURCE_DIGEST_NAME = (
-    "photos.digest"  # in the scene's folder: the digest of the photos that its poses were estimated from
-)
+# This file in the scene's folder holds the digest of the photos from which its poses were estimated.
+SOURCE_DIGEST_NAME = "photos.digest"
 _LOG = logging.getLogger(__name__)
 
 

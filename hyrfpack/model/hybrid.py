@@ -22,7 +22,8 @@ from hyrfpack.ops.rows import take_rows
 from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_views, shade
 from hyrfpack.ops.viewport import Viewport
 
-GAUSSIANS_PER_BLOCK = 1 << 18  # of those for which a field is evaluated at once, unless gradients are recorded
+# Without gradients, fields are evaluated for this many Gaussians at a time, which bounds the memory of hash features.
+GAUSSIANS_PER_FIELD_BLOCK = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -177,8 +178,8 @@ class HybridModel(nn.Module):
         places = field.grid.feature_count
         (weight, w2, w3), (bias, b2, b3) = self._color_layers()
         first = weight.new_empty(len(self), len(bias), dtype=torch.bfloat16 if self._mixed else None)
-        for some, rows in zip(self._blocks(explicit.positions), self._blocks(first), strict=True):
-            rows.copy_(mlp(field.grid(self.cube_coords(some)), [weight[:, :places]], [bias], mixed=self._mixed))
+        for positions, rows in zip(self._blocks(explicit.positions), self._blocks(first), strict=True):
+            rows.copy_(mlp(field.grid(self.cube_coords(positions)), [weight[:, :places]], [bias], mixed=self._mixed))
         return Shading(
             first,
             weight[:, places:].contiguous(),
@@ -191,16 +192,16 @@ class HybridModel(nn.Module):
 
     @torch.no_grad()
     def geometry_outputs(self) -> Tensor:
-        """Return the raw outputs (N, 8) of the geometry field at all Gaussians; they do not depend on their logits."""
+        """Return the raw outputs (N, 8) of the geometry field at the positions of all Gaussians."""
         outputs = self.gaussians.positions.new_empty(len(self), 8)
-        for some, rows in zip(self._blocks(self.gaussians.positions), self._blocks(outputs), strict=True):
-            rows.copy_(self.geometry(self.cube_coords(some), mixed=self._mixed))
+        for positions, rows in zip(self._blocks(self.gaussians.positions), self._blocks(outputs), strict=True):
+            rows.copy_(self.geometry(self.cube_coords(positions), mixed=self._mixed))
         return outputs
 
     @staticmethod
     def _blocks(rows: Tensor) -> tuple[Tensor, ...]:
-        """Split rows (N, ...) into blocks, which bound the memory of hash features."""
-        return rows.split(GAUSSIANS_PER_BLOCK)
+        """Split rows (N, ...) into blocks of GAUSSIANS_PER_FIELD_BLOCK."""
+        return rows.split(GAUSSIANS_PER_FIELD_BLOCK)
 
     @torch.no_grad()
     def geometry_from_outputs(self, outputs: Tensor) -> Geometry:

@@ -532,7 +532,7 @@ class Trainer:
 
         def write() -> None:
             self._write_checkpoint(path, observed, overwrite)
-            self.saved = self.step  # Before rank 0 hears from the others, so that errors name the checkpoint.
+            self.saved = self.step  # Before rank 0 waits for the others, so that errors name the checkpoint.
 
         self.ranks.run_on_main(write)
         self.saved = self.step

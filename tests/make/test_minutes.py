@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from time import monotonic
 
 import numpy as np
@@ -19,6 +20,7 @@ from hyrfpack.make.plan import Plan
 from hyrfpack.make.progress import Reporter
 from hyrfpack.make.source import LoadSettings
 from hyrfpack.progress import StageEvent, ignore_progress
+from hyrfpack.scene import Scene
 from hyrfpack.train import decisions
 
 
@@ -90,6 +92,15 @@ def test_measuring_a_scene_gives_its_cost(scene):
     assert cost.cpu_pass_seconds > 0 and cost.decoding_seconds >= 0 and cost.gaussians > 0
 
 
+def fitted_plan(
+    posed: Path, scene: Scene, requested: Plan, seconds: float, load_settings: LoadSettings | None = None
+) -> Plan:
+    """Return the plan that fits into this time."""
+    reporter = Reporter(["training"], ignore_progress)
+    end, settings = monotonic() + seconds, load_settings or LoadSettings()
+    return fit_plan_to_minutes(posed, settings, scene, requested, CPU_DEVICE, end, 0, PictureCache(), reporter)
+
+
 def test_large_photos_are_reduced_when_time_is_short(posed, scene, monkeypatch, caplog):
     def cost(scene, *_):
         return SceneCost(1e-3 * scene.train[0].camera.width ** 2, 0.0, 0.0, 0.0, 100)
@@ -98,17 +109,7 @@ def test_large_photos_are_reduced_when_time_is_short(posed, scene, monkeypatch, 
     monkeypatch.setattr(minutes, "CANDIDATE_PHOTO_SIZES", (24, 16, 8))
 
     def planned(seconds: float) -> Plan:
-        arguments = (
-            posed,
-            LoadSettings(),
-            scene,
-            make_plan(90_000),
-            CPU_DEVICE,
-            monotonic() + seconds,
-            0,
-            PictureCache(),
-        )
-        return fit_plan_to_minutes(*arguments, Reporter(["training"], ignore_progress))
+        return fitted_plan(posed, scene, make_plan(90_000), seconds)
 
     plans = [planned(seconds) for seconds in (3000.0, 300.0, 100.0)]
     assert [plan.max_size for plan in plans] == [1600, 16, 8] and {plan.target_bytes for plan in plans} == {90_000}
@@ -125,16 +126,7 @@ def test_photos_that_are_small_already_are_timed_at_the_size_asked_for(posed, sc
     monkeypatch.setattr(minutes, "measure_scene_cost", cost)
     monkeypatch.setattr(minutes, "CANDIDATE_PHOTO_SIZES", (24, 16, 8))
     load_settings = LoadSettings(max_size=32)
-    arguments = (
-        posed,
-        load_settings,
-        load_settings.load(posed),
-        make_plan(90_000),
-        CPU_DEVICE,
-        monotonic() + 3000.0,
-        0,
-    )
-    fit_plan_to_minutes(*arguments, PictureCache(), Reporter(["training"], ignore_progress))
+    fitted_plan(posed, load_settings.load(posed), make_plan(90_000), 3000.0, load_settings)
     assert timed == [32]
 
 
@@ -143,17 +135,7 @@ def test_a_long_run_has_the_measured_budget_and_a_short_one_the_default(posed, s
     monkeypatch.setattr(decisions, "measure_budget", lambda *_: (0.5, "by a coin"))
 
     def planned(seconds: float, target_bytes: int | None = None) -> Plan:
-        arguments = (
-            posed,
-            LoadSettings(),
-            scene,
-            make_plan(target_bytes),
-            CPU_DEVICE,
-            monotonic() + seconds,
-            0,
-            PictureCache(),
-        )
-        return fit_plan_to_minutes(*arguments, Reporter(["training"], ignore_progress))
+        return fitted_plan(posed, scene, make_plan(target_bytes), seconds)
 
     short, long, targeted = planned(60.0), planned(600.0), planned(600.0, 90_000)
     assert short.steps < decisions.MIN_BUDGET_STEPS <= long.steps
@@ -164,17 +146,7 @@ def test_a_long_run_has_the_measured_budget_and_a_short_one_the_default(posed, s
 
 def test_too_little_time_gives_a_draft_with_a_note(posed, scene, caplog):
     for seconds in (-1.0, 0.5):
-        arguments = (
-            posed,
-            LoadSettings(),
-            scene,
-            make_plan(20_000),
-            CPU_DEVICE,
-            monotonic() + seconds,
-            0,
-            PictureCache(),
-        )
-        plan = fit_plan_to_minutes(*arguments, Reporter(["training"], ignore_progress))
+        plan = fitted_plan(posed, scene, make_plan(20_000), seconds)
         assert (plan.steps, plan.target_bytes) == (6, 20_000)
     first, *_, last = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert "no time is left for training" in first and "the time is short" in last
@@ -183,17 +155,7 @@ def test_too_little_time_gives_a_draft_with_a_note(posed, scene, caplog):
 def test_an_explicit_number_of_gaussians_replaces_the_measured_budget(posed, scene, monkeypatch):
     monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(0.0, 1e-5, 0.0, 0.0, 100))
     monkeypatch.setattr(decisions, "measure_budget", None)
-    arguments = (
-        posed,
-        LoadSettings(),
-        scene,
-        make_plan(max_gaussians=700),
-        CPU_DEVICE,
-        monotonic() + 600,
-        0,
-        PictureCache(),
-    )
-    plan = fit_plan_to_minutes(*arguments, Reporter(["training"], ignore_progress))
+    plan = fitted_plan(posed, scene, make_plan(max_gaussians=700), 600)
     assert (plan.train_config(0).max_gaussians, plan.budget_factor) == (700, None)
 
 
@@ -201,17 +163,7 @@ def test_photos_are_never_larger_than_asked_for(posed, scene, monkeypatch):
     monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(1e-3, 0.0, 0.0, 0.0, 100))
     load_settings = LoadSettings(max_size=24)
     for seconds in (600.0, -1.0):
-        arguments = (
-            posed,
-            load_settings,
-            load_settings.load(posed),
-            make_plan(90_000),
-            CPU_DEVICE,
-            monotonic() + seconds,
-            0,
-            PictureCache(),
-        )
-        assert fit_plan_to_minutes(*arguments, Reporter(["training"], ignore_progress)).max_size == 24
+        assert fitted_plan(posed, load_settings.load(posed), make_plan(90_000), seconds, load_settings).max_size == 24
 
 
 @pytest.mark.usefixtures("fake_stages")

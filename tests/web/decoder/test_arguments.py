@@ -10,7 +10,7 @@ from web.scripts import run_script
 from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
 
 GOLDEN_FILE = Path(__file__).parents[2] / "golden" / "v1.1_compact_layers.hyrf"
-FIX = "pass new Uint8Array(await response.arrayBuffer())."
+FIX_SENTENCE = "pass new Uint8Array(await response.arrayBuffer())."
 CLASS_BY_INPUT = {
     "undefined": "Undefined",
     "null": "Null",
@@ -42,14 +42,14 @@ def answers() -> dict:
 def test_values_that_are_no_bytes_are_refused_by_their_type(answers: dict, function: str, file: str):
     refused = {what: answer for what, answer in answers[function].items() if answer}
     assert refused == {
-        what: f"TypeError: {file} must be a Uint8Array, not {type_name}; {FIX}"
+        what: f"TypeError: {file} must be a Uint8Array, not {type_name}; {FIX_SENTENCE}"
         for what, type_name in CLASS_BY_INPUT.items()
     }
 
 
 def test_what_open_file_returns_is_refused_by_the_name_of_the_file(answers: dict):
     assert answers["openFile"] == {
-        what: f"TypeError: shared.hyrf must be a Uint8Array, not {CLASS_BY_INPUT[what]}; {FIX}"
+        what: f"TypeError: shared.hyrf must be a Uint8Array, not {CLASS_BY_INPUT[what]}; {FIX_SENTENCE}"
         for what in ("undefined", "a Response")
     }
 
