@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from hyrfpack.compress.rate_distortion import choose_step_codes, choose_symbols, estimate_code_bits
+from hyrfpack.compress.rate_distortion import (
+    LAMBDA_PER_DISTORTION,
+    choose_step_codes,
+    choose_symbols,
+    estimate_code_bits,
+)
 from hyrfpack.format.compact.groups import ENTROPY_MODEL_COUNT, MAX_ABS_SYMBOL, GroupSymbols, StepGroups, iter_blocks
+from hyrfpack.quant.rans import uses_numba
 from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step
 
 # Lower bound of a number's sensitivity, as a share of the mean of its group.
@@ -13,7 +19,12 @@ _MIN_RELATIVE_SENSITIVITY = 0.01
 
 
 def quantize_groups(
-    values: np.ndarray, groups: StepGroups, sensitivity: np.ndarray, distortion: float, reach: int = 1
+    values: np.ndarray,
+    groups: StepGroups,
+    sensitivity: np.ndarray,
+    distortion: float,
+    reach: int = 1,
+    implementation: str = "auto",
 ) -> GroupSymbols:
     """Choose the step of each group and the symbol of each number.
 
@@ -24,6 +35,7 @@ def quantize_groups(
         distortion: D, the error that each number may add, see `hyrfpack.compress.rate_distortion`.
         reach: distance in steps of the furthest candidate from the nearest symbol; 0 takes the nearest and ignores
             the rate.
+        implementation: "numpy", "cpu" (Numba) or "auto"; the symbols are the same.
     """
     index, count = groups.index, groups.count
     members = np.maximum(np.bincount(index, minlength=count), 1)
@@ -37,17 +49,69 @@ def quantize_groups(
     if reach:
         contexts = groups.gather(models)
         bits = estimate_code_bits(symbols, contexts, ENTROPY_MODEL_COUNT, reach)
+        choose = _choose_compiled if uses_numba(implementation) else _choose
+        choose(
+            values,
+            groups,
+            steps,
+            sensitivity,
+            _MIN_RELATIVE_SENSITIVITY * mean,
+            contexts,
+            bits,
+            distortion,
+            reach,
+            symbols,
+        )
         for part in iter_blocks(len(values)):
-            weights = np.maximum(sensitivity[part], (_MIN_RELATIVE_SENSITIVITY * mean)[index[part]])
-            step = steps[index[part]]
-
-            def error(candidates: np.ndarray, weights=weights, step=step, wanted=values[part]) -> np.ndarray:
-                return weights * (candidates * step - wanted) ** 2
-
-            chosen = choose_symbols(symbols[part], error, contexts[part], bits, distortion, reach)
-            symbols[part] = np.where(unread[index[part]], 0, np.clip(chosen, -MAX_ABS_SYMBOL, MAX_ABS_SYMBOL))
+            chosen = np.clip(symbols[part], -MAX_ABS_SYMBOL, MAX_ABS_SYMBOL)
+            symbols[part] = np.where(unread[index[part]], 0, chosen)
     codes[np.bincount(index, np.abs(symbols), count) == 0] = ALL_ZERO_CODE
     return GroupSymbols(codes, models, symbols, (symbols * groups.gather(steps)).astype(np.float32))
+
+
+def _choose(
+    values: np.ndarray,
+    groups: StepGroups,
+    steps: np.ndarray,
+    sensitivity: np.ndarray,
+    min_sensitivity: np.ndarray,
+    contexts: np.ndarray,
+    bits: tuple[np.ndarray, int],
+    distortion: float,
+    reach: int,
+    symbols: np.ndarray,
+) -> None:
+    """Replace the nearest symbols (n,) by those of the lowest cost within `reach`."""
+    for part in iter_blocks(len(values)):
+        weights = np.maximum(sensitivity[part], min_sensitivity[groups.index[part]])
+        step = steps[groups.index[part]]
+
+        def error(candidates: np.ndarray, weights=weights, step=step, wanted=values[part]) -> np.ndarray:
+            return weights * (candidates * step - wanted) ** 2
+
+        symbols[part] = choose_symbols(symbols[part], error, contexts[part], bits, distortion, reach)
+
+
+def _choose_compiled(
+    values: np.ndarray,
+    groups: StepGroups,
+    steps: np.ndarray,
+    sensitivity: np.ndarray,
+    min_sensitivity: np.ndarray,
+    contexts: np.ndarray,
+    bits: tuple[np.ndarray, int],
+    distortion: float,
+    reach: int,
+    symbols: np.ndarray,
+) -> None:
+    """Do what `_choose` does, by Numba."""
+    from hyrfpack.compress import quantization_kernels
+
+    table, lowest = bits
+    rates = LAMBDA_PER_DISTORTION * distortion * table
+    quantization_kernels.choose_group_symbols(
+        values, groups.index, steps, min_sensitivity, sensitivity, contexts, rates, lowest, reach, symbols
+    )
 
 
 def choose_group_codes(groups: StepGroups, sensitivity: np.ndarray, distortion: float) -> tuple[np.ndarray, np.ndarray]:

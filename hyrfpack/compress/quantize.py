@@ -68,7 +68,7 @@ def quantize(
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
-    arrays = {group: values.astype(np.float64) for group, values in to_arrays(model).items()}
+    arrays = {group: values.astype(np.float64) for group, values in to_arrays(model).items() if group in sections}
     sensitivity, d = sensitivity.subset(plan.kept), plan.distortion_per_number
     jobs: dict[str, Callable[[], Any]] = {
         group: partial(quantize_groups, arrays[group].ravel(), groups, sensitivity.fields[group], d, reach)
@@ -94,7 +94,7 @@ def quantize(
         members = slice(stop, stop := stop + len(classes))
         for group in logits:
             is_opacity = group == OPACITIES
-            cost = partial(_offset_error, error, members.start) if is_opacity and error else None
+            cost = error[members] if is_opacity and error else None
             own_reach = reach and OPACITY_REACH_STEPS if is_opacity else reach
             for column, values in enumerate(arrays[group][members].T):
                 jobs[f"{group} {layer} {column}"] = partial(
@@ -119,11 +119,6 @@ def quantize(
     quantized_residuals = [{group: done[f"{group} {layer}"] for group in residuals} for layer in layers]
     groups = {group: done[group] for group in plan.groups if group in sections}
     return QuantizedModel(plan, channels, groups, quantized_residuals)
-
-
-def _offset_error(error: ErrorModel, start: int, places: Any, candidates: np.ndarray) -> np.ndarray:
-    """Evaluate an error model at places that are counted from `start`."""
-    return error(places + start, candidates)
 
 
 def field_opacity_logits(model: HybridModel) -> np.ndarray:
@@ -152,7 +147,5 @@ def opacity_error_model(
     opacities = expit(field_logits + logits)
     weights = sensitivity / np.maximum(opacities * (1 - opacities), 1e-4) ** 2
 
-    def error(places: Any, candidates: np.ndarray) -> np.ndarray:
-        return weights[places] * (expit(field_logits[places] + candidates) - opacities[places]) ** 2
-
+    error = ErrorModel(opacities, weights, field_logits)
     return np.clip(logits, -SATURATION_LOGIT - field_logits, SATURATION_LOGIT - field_logits), error

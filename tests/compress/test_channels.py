@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from property_tests import examples
 
 from hyrfpack.compress import channels
-from hyrfpack.compress.channels import quantize_channel
+from hyrfpack.compress.channels import ErrorModel, quantize_channel
 from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE, Channel, decode_channel, encode_channel
 from hyrfpack.quant.steps import decode_step
 
@@ -196,13 +196,11 @@ def test_prediction_makes_smooth_channels_smaller(monkeypatch: pytest.MonkeyPatc
     assert predicted < 0.85 * size()
 
 
-def test_a_custom_error_function_selects_the_cheapest_symbols() -> None:
+def test_an_error_model_selects_the_cheapest_symbols() -> None:
     """Values below 0 have no error here, so they all become the most common symbol within reach."""
     values = laplace_values(4000)
 
-    def error(places: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-        return np.where(values[places] < 0, 0.0, (candidates - values[places]) ** 2)
-
+    error = ErrorModel(values, np.where(values < 0, 0.0, 1.0))
     classes, ones = single_class(4000), np.ones(4000)
     counted = quantize_channel(values, classes, ones, distortion_for_error(0.1), error, reach=4)
     plain = quantize_channel(values, classes, ones, distortion_for_error(0.1), reach=4)
@@ -210,6 +208,28 @@ def test_a_custom_error_function_selects_the_cheapest_symbols() -> None:
     assert len(encode_channel(counted, classes)) < 0.8 * len(encode_channel(plain, classes))
     off = np.abs(counted.values - values)
     assert off[values >= 0].mean() < off[values < 0].mean() / 2
+
+
+@pytest.mark.parametrize("reach", [0, 1, 4])
+@pytest.mark.parametrize("saturates", [False, True])
+@pytest.mark.parametrize("name", HARD_CASES)
+def test_compiled_and_plain_choices_are_the_same(name: str, saturates: bool, reach: int) -> None:
+    values = HARD_CASES[name]
+    rng = np.random.default_rng(0)
+    classes = (np.arange(len(values)) * 7 % 3).astype(np.uint8)
+    weights = 10.0 ** -classes.astype(float) * rng.uniform(0.5, 2, size=len(values))
+    error = ErrorModel(rng.uniform(size=len(values)), weights, rng.normal(size=len(values))) if saturates else None
+
+    for distortion in (1e-10, 1e-4, 1e-1, 1e6):
+        compiled, plain = (
+            quantize_channel(values, classes, weights, distortion, error, reach, implementation)
+            for implementation in ("cpu", "numpy")
+        )
+
+        assert (compiled.mean, compiled.weight) == (plain.mean, plain.weight)
+        np.testing.assert_array_equal(compiled.codes, plain.codes)
+        np.testing.assert_array_equal(compiled.residuals, plain.residuals)
+        np.testing.assert_array_equal(compiled.values, plain.values)
 
 
 def test_encoding_is_deterministic() -> None:

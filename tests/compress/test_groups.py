@@ -146,6 +146,25 @@ def test_values_beyond_the_largest_symbol_are_clipped_with_reach_too(value: floa
     check_round_trip(quantize_groups(np.array([value, 1.0]), groups, np.ones(2), distortion), groups)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("reach", [0, 1, 3])
+@pytest.mark.parametrize("count", [0, 1, 5000, 70_000])
+def test_compiled_and_plain_choices_are_the_same(count: int, reach: int, dtype: type) -> None:
+    groups = random_groups(count, 20)
+    groups = StepGroups(groups.index.astype(np.uint16), groups.count)
+    values = laplace_values(groups).astype(dtype)
+    sensitivity = np.where(groups.index == 3, 0.0, np.random.default_rng(2).exponential(size=count))
+
+    for distortion in (1e-16, 1e-2, 1.0, 1e9):
+        compiled, plain = (
+            quantize_groups(values, groups, sensitivity, distortion, reach, implementation)
+            for implementation in ("cpu", "numpy")
+        )
+
+        for name in ("codes", "models", "symbols", "values"):
+            np.testing.assert_array_equal(getattr(compiled, name), getattr(plain, name))
+
+
 def test_encoding_is_deterministic() -> None:
     groups = random_groups(3000, 30)
     values = laplace_values(groups)
