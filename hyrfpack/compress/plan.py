@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +16,9 @@ from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE
 from hyrfpack.format.compact.plan import Layer, Plan, build_step_groups
 from hyrfpack.format.sections import COLORS, DECODER_SECTIONS, TABLE_SECTIONS
 from hyrfpack.model import HybridModel
-from hyrfpack.parallel.pool import map_row_blocks
+from hyrfpack.parallel.pool import map_row_blocks, parallel_map, run_jobs
 from hyrfpack.quant.morton import MAX_BITS_PER_AXIS
-from hyrfpack.quant.points import LatticePoints, encode_points
+from hyrfpack.quant.points import LatticePoints, sort_points
 
 IMPORTANCE_CLASS_COUNT = 6
 # Each class spans this much log2 of sensitivity; much narrower or wider classes give larger files.
@@ -46,19 +49,20 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, p
     kept_sensitivity = sensitivity.subset(kept)
     cube, classes = _cube_coords(model), importance_classes(kept_sensitivity)
     bits = position_bits(kept_sensitivity.positions, classes, per_number)
-    layers, order = [], []
-    for kinds in _group_classes_into_layers(np.bincount(classes, minlength=IMPORTANCE_CLASS_COUNT)):
+
+    def sort_members(kinds: list[int]) -> tuple[Layer, np.ndarray]:
         members = np.flatnonzero(np.isin(classes, kinds))
-        layer, index = _encode_layer(cube[kept[members]], classes[members], bits)
-        layers.append(layer)
-        order.append(members[index])
+        layer, index = _sort_layer(cube[kept[members]], classes[members], bits)
+        return layer, members[index]
+
+    kinds_by_layer = _group_classes_into_layers(np.bincount(classes, minlength=IMPORTANCE_CLASS_COUNT))
+    layers, order = zip(*parallel_map(sort_members, kinds_by_layer), strict=True)
     kept = kept[np.concatenate(order)]
-    basis = color_basis(to_arrays(model)[COLORS][kept])
-    groups = {
-        group: build_step_groups(group, model.config, layers[0].points)
-        for group in (*TABLE_SECTIONS, *DECODER_SECTIONS)
-    }
-    return Plan(kept, tuple(layers), basis, groups, per_number, len(model))
+    jobs: dict[str, Callable[[], Any]] = {COLORS: lambda: color_basis(to_arrays(model)[COLORS][kept])}
+    for group in (*TABLE_SECTIONS, *DECODER_SECTIONS):
+        jobs[group] = partial(build_step_groups, group, model.config, layers[0].points)
+    done = run_jobs(jobs)
+    return Plan(kept, layers, done.pop(COLORS), done, per_number, len(model))
 
 
 def distortion_per_number(model: HybridModel, distortion: float) -> float:
@@ -101,25 +105,28 @@ def replan_moved(plan: Plan, model: HybridModel) -> tuple[Plan, HybridModel]:
         model: the stored part of a model, in the order of `plan` (made by `plan.apply`), after its Gaussians moved.
     """
     cube = _cube_coords(model)
-    layers, order, start = [], [], 0
-    for points in (layer.points for layer in plan.layers):
-        members = np.arange(start, start := start + len(points.classes))
-        layer, index = _encode_layer(cube[members], points.classes, points.bits)
-        layers.append(layer)
-        order.append(members[index])
+    stops = np.cumsum([len(layer.points.classes) for layer in plan.layers])
+
+    def sort_again(number: int) -> tuple[Layer, np.ndarray]:
+        points = plan.layers[number].points
+        members = np.arange(stops[number] - len(points.classes), stops[number])
+        layer, index = _sort_layer(cube[members], points.classes, points.bits)
+        return layer, members[index]
+
+    layers, order = zip(*parallel_map(sort_again, range(len(plan.layers))), strict=True)
     places = np.concatenate(order)
     groups = {group: build_step_groups(group, model.config, layers[0].points) for group in plan.groups}
-    moved = replace(plan, kept=places, layers=tuple(layers), groups=groups)
+    moved = replace(plan, kept=places, layers=layers, groups=groups)
     return replace(moved, kept=plan.kept[places]), moved.apply(model)
 
 
-def _encode_layer(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> tuple[Layer, np.ndarray]:
-    """Encode points (n, 3) of the cube as a layer; return it and the index of the point at each place of the layer."""
+def _sort_layer(cube: np.ndarray, classes: np.ndarray, bits: np.ndarray) -> tuple[Layer, np.ndarray]:
+    """Sort points (n, 3) of the cube as a layer; return it and the index of the point at each place of the layer."""
     while True:
-        data, order, points = encode_points(snap_to_lattice(cube, classes, bits))
-        # The encoder refines classes coarser than its base resolution, so their points are assigned to cells again.
+        order, points, base_bits = sort_points(snap_to_lattice(cube, classes, bits))
+        # Classes coarser than the base are refined to it, so their points are assigned to cells again.
         if (points.bits == bits).all():
-            return Layer(points, data), order
+            return Layer(points, base_bits), order
         bits = points.bits
 
 

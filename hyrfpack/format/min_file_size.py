@@ -19,7 +19,7 @@ from hyrfpack.format.sections import DECODER_SECTIONS, TABLE_SECTIONS, part_sect
 from hyrfpack.format.versions import MERGED_MINOR_VERSION
 from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.quant.points import LatticePoints, encode_points
+from hyrfpack.quant.points import LatticePoints, sort_points
 from hyrfpack.quant.steps import ALL_ZERO_CODE
 
 # A table of zeros takes the same number of bytes at any size. The smallest table is encoded fastest.
@@ -49,9 +49,9 @@ def min_file_bytes(provenance: dict | None = None, exposure: ExposureMap | None 
     model = HybridModel(config, Gaussians(triple, triple, single, single), torch.Generator().manual_seed(0))
     model.exposure = exposure
     no_points = LatticePoints(np.zeros((0, 3), np.int64), np.zeros(0, np.uint8), np.ones(1, np.int64))
-    data, _, points = encode_points(no_points)
+    _, points, base_bits = sort_points(no_points)
     groups = {group: build_step_groups(group, config, points) for group in (*TABLE_SECTIONS, *DECODER_SECTIONS)}
-    plan = Plan(np.zeros(0, np.int64), (Layer(points, data),), np.eye(3, dtype=np.float32), groups, 0.0, 0)
+    plan = Plan(np.zeros(0, np.int64), (Layer(points, base_bits),), np.eye(3, dtype=np.float32), groups, 0.0, 0)
     empty = Channel(np.float32(0), 0, np.zeros(1, np.uint8), np.zeros(0, np.int64), np.zeros(0))
     channels = {group: [empty] * count for group, count in LOGIT_COLUMNS.items()}
     symbols = {group: _zero_symbols(members) for group, members in groups.items()}

@@ -57,6 +57,16 @@ def encode_points(points: LatticePoints, *, keep_bits: bool = False) -> tuple[by
         the decoder will return them. Classes with fewer bits than the base get as many bits as the base; with
         `keep_bits`, only classes without points.
     """
+    order, ordered, base = sort_points(points, keep_bits=keep_bits)
+    return encode_sorted_points(ordered, base), order, ordered
+
+
+def sort_points(points: LatticePoints, *, keep_bits: bool = False) -> tuple[np.ndarray, LatticePoints, int]:
+    """Sort points as `encode_points` does.
+
+    Returns:
+        The order and the points in it, as from `encode_points`; and the base, the bits of each axis to sort by.
+    """
     cells, classes, bits = points.cells, points.classes, points.bits
     finest = int(bits.max(initial=1))
     codes = morton_codes(cells << (finest - bits[classes])[:, None])
@@ -67,16 +77,20 @@ def encode_points(points: LatticePoints, *, keep_bits: bool = False) -> tuple[by
     refined = np.maximum(bits, base)
     classes = classes[order]
     cells = points.cells[order] << (refined - bits)[classes][:, None]
-    ordered = LatticePoints(cells, classes, refined)
+    return order, LatticePoints(cells, classes, refined), base
 
-    finer = (3 * (refined - base)).astype(np.uint8)[classes]
-    codes = morton_codes(cells)
+
+def encode_sorted_points(points: LatticePoints, base: int) -> bytes:
+    """Encode points that `sort_points` has sorted by `base` bits of each axis."""
+    classes, bits = points.classes, points.bits
+    finer = (3 * (bits - base)).astype(np.uint8)[classes]
+    codes = morton_codes(points.cells)
     gaps = np.diff(codes >> finer, prepend=0)
     gap_bytes = encode_integers(gaps)
     class_bytes = encode_integers(classes, (gaps == 0).view(np.uint8))
-    header = _HEADER_STRUCT.pack(base, len(bits), len(gap_bytes), len(class_bytes)) + refined.astype(np.uint8).tobytes()
+    header = _HEADER_STRUCT.pack(base, len(bits), len(gap_bytes), len(class_bytes)) + bits.astype(np.uint8).tobytes()
     tail_bytes = pack_bits(codes.view(np.uint64), finer)
-    return b"".join((header, gap_bytes, class_bytes, tail_bytes)), order, ordered
+    return b"".join((header, gap_bytes, class_bytes, tail_bytes))
 
 
 def decode_points(data: bytes | memoryview, count: int) -> LatticePoints:

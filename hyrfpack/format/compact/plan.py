@@ -29,12 +29,12 @@ class Layer:
     """Gaussians that are stored together; the first layers of a file make a coarser model.
 
     Attributes:
-        points: lattice cell and class of each Gaussian.
-        positions: encoded bytes of `points`.
+        points: lattice cell and class of each Gaussian, sorted by `quant.points.sort_points`.
+        base_bits: the bits of each axis that they are sorted by.
     """
 
     points: LatticePoints
-    positions: bytes
+    base_bits: int
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from hyrfpack.format.sections import (
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.parallel.pool import run_jobs
 from hyrfpack.quant import DamagedDataError
-from hyrfpack.quant.points import LatticePoints
+from hyrfpack.quant.points import LatticePoints, encode_sorted_points
 
 CODEC_POINTS = 6
 CODEC_CHANNELS = 7
@@ -79,6 +79,11 @@ def encode(model: HybridModel, quantized: QuantizedModel) -> tuple[list[Section]
     """
     plan = quantized.plan
 
+    def encode_positions(layer: int) -> Section:
+        points = plan.layers[layer].points
+        data = encode_sorted_points(points, plan.layers[layer].base_bits)
+        return Section(layer_section(POSITIONS, layer), CODEC_POINTS, data, 12 * len(points.classes))
+
     def encode_channels(layer: int, group: str) -> Section:
         basis = plan.basis.astype("<f4").tobytes() if group == COLORS else b""
         classes = plan.layers[layer].points.classes
@@ -98,12 +103,10 @@ def encode(model: HybridModel, quantized: QuantizedModel) -> tuple[list[Section]
     groups = (*LAYERED_SECTIONS, *widths)
     jobs: dict[str, Callable[[], Section]] = {group: partial(encode_numbers, group) for group in plan.groups}
     for layer in range(len(plan.layers)):
+        jobs[layer_section(POSITIONS, layer)] = partial(encode_positions, layer)
         jobs |= {layer_section(group, layer): partial(encode_channels, layer, group) for group in LOGIT_COLUMNS}
         jobs |= {layer_section(group, layer): partial(encode_layer_residuals, layer, group) for group in widths}
     done = run_jobs(jobs)
-    for layer, part in enumerate(plan.layers):
-        tag = layer_section(POSITIONS, layer)
-        done[tag] = Section(tag, CODEC_POINTS, part.positions, 12 * len(part.points.classes))
     further = [layer_section(group, layer) for layer in range(1, len(plan.layers)) for group in groups]
     settings = {"distortion": plan.distortion_per_number, "gaussians_before": plan.gaussians_before}
     return [done[tag] for tag in (*DECODER_SECTIONS, *groups, *TABLE_SECTIONS, *further)], settings
