@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -21,9 +22,11 @@ from hyrfpack.ops.rasterize import Gaussians3D
 from hyrfpack.ops.rows import take_rows
 from hyrfpack.ops.shade import DIRECTION_FEATURES, Shading, encode_views, shade
 from hyrfpack.ops.viewport import Viewport
+from hyrfpack.parallel.pool import parallel_map
 
 # Without gradients, fields are evaluated for this many Gaussians at a time, which bounds the memory of hash features.
-GAUSSIANS_PER_FIELD_BLOCK = 1 << 18
+# On the CPU one thread evaluates a block, and each thread should get several.
+GAUSSIANS_PER_FIELD_BLOCK = {"cpu": 1 << 15, "cuda": 1 << 18}
 
 
 @dataclass(frozen=True)
@@ -178,10 +181,12 @@ class HybridModel(nn.Module):
         places = field.grid.feature_count
         (weight, w2, w3), (bias, b2, b3) = self._color_layers()
         first = weight.new_empty(len(self), len(bias), dtype=torch.bfloat16 if self._mixed else None)
-        for positions, rows in zip(self._blocks(explicit.positions), self._blocks(first), strict=True):
-            rows.copy_(mlp(field.grid(self.cube_coords(positions)), [weight[:, :places]], [bias], mixed=self._mixed))
+
+        def evaluate(positions: Tensor) -> Tensor:
+            return mlp(field.grid(self.cube_coords(positions)), [weight[:, :places]], [bias], mixed=self._mixed)
+
         return Shading(
-            first,
+            self._fill_blocks(first, evaluate),
             weight[:, places:].contiguous(),
             (w2, w3),
             (b2, b3),
@@ -194,14 +199,17 @@ class HybridModel(nn.Module):
     def geometry_outputs(self) -> Tensor:
         """Return the raw outputs (N, 8) of the geometry field at the positions of all Gaussians."""
         outputs = self.gaussians.positions.new_empty(len(self), 8)
-        for positions, rows in zip(self._blocks(self.gaussians.positions), self._blocks(outputs), strict=True):
-            rows.copy_(self.geometry(self.cube_coords(positions), mixed=self._mixed))
-        return outputs
+        return self._fill_blocks(
+            outputs, lambda positions: self.geometry(self.cube_coords(positions), mixed=self._mixed)
+        )
 
-    @staticmethod
-    def _blocks(rows: Tensor) -> tuple[Tensor, ...]:
-        """Split rows (N, ...) into blocks of GAUSSIANS_PER_FIELD_BLOCK."""
-        return rows.split(GAUSSIANS_PER_FIELD_BLOCK)
+    def _fill_blocks(self, rows: Tensor, evaluate: Callable[[Tensor], Tensor]) -> Tensor:
+        """Write the function of the positions of all Gaussians to `rows` (N, ...), block by block; return them."""
+        positions, count = self.gaussians.positions, GAUSSIANS_PER_FIELD_BLOCK.get(rows.device.type, 1 << 18)
+        blocks = list(zip(positions.split(count), rows.split(count), strict=True))
+        fill = torch.no_grad()(lambda block: block[1].copy_(evaluate(block[0])))
+        parallel_map(fill, blocks, rows.device)
+        return rows
 
     @torch.no_grad()
     def geometry_from_outputs(self, outputs: Tensor) -> Geometry:

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scenes import look_at, small_model
 
-from hyrfpack.model import Frame
+from hyrfpack.model import Frame, hybrid
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.viewport import Viewport
 
@@ -223,6 +223,16 @@ def test_a_gaussian_at_the_viewpoint_has_a_finite_colour_and_gradient():
     colors = model.decode_colors(torch.tensor(CAMERA_POSITION))
     colors.sum().backward()
     assert torch.isfinite(colors).all() and torch.isfinite(model.gaussians.positions.grad).all()
+
+
+def test_fields_evaluated_in_blocks_have_the_same_values(monkeypatch):
+    model = random_model()
+    outputs, shading = model.geometry_outputs(), model.shading()
+
+    monkeypatch.setattr(hybrid, "GAUSSIANS_PER_FIELD_BLOCK", {"cpu": 7})
+
+    torch.testing.assert_close(model.geometry_outputs(), outputs)
+    torch.testing.assert_close(model.shading().first_layer, shading.first_layer)
 
 
 def test_an_empty_model_decodes_to_nothing():
