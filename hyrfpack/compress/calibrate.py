@@ -21,6 +21,7 @@ import torch
 from hyrfpack.compress.correction import SensitivityCorrection
 from hyrfpack.compress.part_errors import PartErrors, PruningErrors, QuantizationErrors
 from hyrfpack.compress.plan import distortion_per_number, indices_to_keep
+from hyrfpack.compress.planner import Planner
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.sensitivity import TARGET_DRAWN_GAUSSIANS, Sensitivity, measure_sensitivity
 from hyrfpack.model import Decoded, HybridModel
@@ -40,6 +41,7 @@ def measure_calibrated_sensitivity(
     prune: bool = True,
     progress: Progress = ignore_progress,
     drawn: int = TARGET_DRAWN_GAUSSIANS,
+    planner: Planner | None = None,
 ) -> tuple[Sensitivity, ReferenceRenders]:
     """Measure a model's sensitivities, calibrate them for a distortion, and return them with the reference renders.
 
@@ -48,6 +50,7 @@ def measure_calibrated_sensitivity(
         distortion, prune: as `make_plan` takes them.
         progress: called with `TaskEvent`s.
         drawn: as `measure_sensitivity` takes it.
+        planner: plans of the model, if they are used afterwards.
 
     Raises:
         HyrfError: a number of the model is NaN or infinite.
@@ -63,6 +66,7 @@ def measure_calibrated_sensitivity(
         distortion,
         prune,
         calibrating,
+        planner,
     )
     return calibrated, replace(references, colors=[])  # Colours take memory, and only calibration uses them.
 
@@ -76,6 +80,7 @@ def calibrate(
     distortion: float,
     prune: bool = True,
     progress: Progress = ignore_progress,
+    planner: Planner | None = None,
 ) -> Sensitivity:
     """Scale sensitivities so that they predict the error measured on renders, for plans of about this distortion.
 
@@ -84,6 +89,7 @@ def calibrate(
         references: renders of the model.
         distortion, prune: as `make_plan` takes them.
         progress: called with `TaskEvent`s.
+        planner: as `measure_calibrated_sensitivity` takes it.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
@@ -102,7 +108,9 @@ def calibrate(
     pruned, outputs, geometry = model.subset(index), outputs[index], geometry[index]
     decoded, colors = Decoded(geometry, shading=None), references.colors_of(kept)
     references = ReferenceRenders.from_views(references.views, pruned, decoded, colors)
-    quantization = QuantizationErrors(model, pruned, geometry, outputs, references, distortion, prune)
+    quantization = QuantizationErrors(
+        planner or Planner(model, prune), pruned, geometry, outputs, references, distortion
+    )
     return _match_measurements(sensitivity, quantization, distortion, part_of_progress(progress, 0.2, 1.0))
 
 

@@ -20,7 +20,8 @@ from hyrfpack.compress.limits import (
 )
 from hyrfpack.compress.part_errors import predict_errors
 from hyrfpack.compress.plan import make_plan
-from hyrfpack.compress.quantize import field_opacity_logits, quantize
+from hyrfpack.compress.planner import Planner
+from hyrfpack.compress.quantize import field_opacity_logits, opacity_column, quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.data import PictureCache
@@ -60,6 +61,7 @@ class Packer:
         progress: called with `TaskEvent`s.
         cache: cache of decoded photos.
         ranks: processes that fine-tune together.
+        planner: the planner that the sensitivities were calibrated with, which may have the plan already.
     """
 
     model: HybridModel
@@ -71,14 +73,15 @@ class Packer:
     progress: Progress = ignore_progress
     cache: PictureCache = field(default_factory=PictureCache)
     ranks: Ranks = SINGLE_PROCESS
+    planner: Planner | None = None
 
     def encode(self, distortion: float, progress: Progress = ignore_progress) -> EncodedCandidate:
         """Encode a file that adds an estimated `distortion` to the mean squared error of pictures."""
         progress(TaskEvent("planning quantisation", 0.0))
         model, steps = self.model, self.finetune_steps
-        plan = make_plan(model, self.sensitivity, distortion, self.prune)
         if steps:
             assert self.scene is not None
+            plan = make_plan(model, self.sensitivity, distortion, self.prune)
             _LOG.info(f"fine-tuning for {steps:,} steps")
             planned, plan = finetune(
                 model,
@@ -91,11 +94,12 @@ class Packer:
                 progress=part_of_progress(progress, 0.0, 0.9),
                 ranks=self.ranks,
             )
+            field_logits = field_opacity_logits(planned)
         else:
-            planned = plan.apply(model)
+            plans = (self.planner or Planner(model, self.prune)).plan(self.sensitivity, distortion)
+            planned, plan, field_logits = plans.model, plans.plan, opacity_column(plans.geometry_outputs)
         progress(TaskEvent("quantising", 0.9 if steps else 0.1))
         reach = 0 if steps else 1
-        field_logits = field_opacity_logits(planned)
         quantized = quantize(planned, plan, self.sensitivity, reach=reach, field_logits=field_logits)
         progress(TaskEvent("entropy coding", 0.95 if steps else 0.6))
         data = encode_model(planned, "compact", self.provenance, quantized=quantized)

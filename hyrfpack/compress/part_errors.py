@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 import torch
 
-from hyrfpack.compress.plan import distortion_per_number, indices_to_keep, make_plan
+from hyrfpack.compress.plan import distortion_per_number, indices_to_keep
+from hyrfpack.compress.planner import PlannedModel, Planner
 from hyrfpack.compress.quantize import opacity_column, opacity_error_model, quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.residuals import residual_sensitivity
 from hyrfpack.compress.sensitivity import PRUNED_KEY, Sensitivity
 from hyrfpack.format.arrays import group_shapes, iter_parameters, residual_widths, to_arrays
-from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.compact.quantized import QuantizedModel
 from hyrfpack.format.sections import (
     COLORS,
@@ -33,6 +34,7 @@ from hyrfpack.format.sections import (
     TABLE_SECTIONS,
 )
 from hyrfpack.model import Decoded, Geometry, HybridModel
+from hyrfpack.parallel.pool import run_jobs
 from hyrfpack.progress import Progress, TaskEvent
 
 # The sections that are quantised and compared together. A decoder has so few numbers that its error depends on chance,
@@ -114,71 +116,59 @@ class QuantizationErrors:
 
     Attributes:
         parts: the parts that the model has.
-        model: the model to compress, before pruning.
+        planner: plans of the model to compress, before pruning.
         pruned: the model after pruning.
         geometry: the geometry of its Gaussians.
         geometry_outputs: (M, 8) the result of `pruned.geometry_outputs()`.
         references: renders of the pruned model.
-        distortion, prune: as in `make_plan`.
+        distortion: as in `make_plan`.
     """
 
-    model: HybridModel
+    planner: Planner
     pruned: HybridModel
     geometry: Geometry
     geometry_outputs: torch.Tensor
     references: ReferenceRenders
     distortion: float
-    prune: bool
-    # The sensitivities of positions that the last plan was made for; the plan; the planned model and its
-    # `geometry_outputs()`.
-    _last_plan: tuple[np.ndarray, Plan, HybridModel, torch.Tensor] | None = field(default=None, init=False)
     parts: tuple[Part, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        groups = set(group_shapes(self.model.config, 0))
+        groups = set(group_shapes(self.pruned.config, 0))
         self.parts = tuple(part for part in QUANTIZED_PARTS if groups.issuperset(part))
 
     def measure(self, sensitivity: Sensitivity, parts: list[Part], progress: Progress) -> dict[Part, ErrorMeasurement]:
         """Quantise all of `parts` and measure the error of each one alone, see `PartErrors.measure`."""
-        plan, planned, outputs = self._plan(sensitivity)
-        field_logits = opacity_column(outputs)
+        planned = self.planner.plan(sensitivity, self.distortion)
+        field_logits = opacity_column(planned.geometry_outputs)
         names = [name for part in parts for name in part]
-        quantized = quantize(planned, plan, sensitivity, sections=names, field_logits=field_logits)
-        by_section = _predict_quantization_errors(planned, quantized, sensitivity, field_logits)
+        quantized = quantize(planned.model, planned.plan, sensitivity, sections=names, field_logits=field_logits)
+        by_section = _predict_quantization_errors(planned.model, quantized, sensitivity, field_logits)
         arrays = _undo_plan_order(quantized)
         errors = {}
         for number, part in enumerate(parts):
             contents = " and ".join(SECTION_CONTENTS[name] for name in part)
             progress(TaskEvent(f"calibrating predicted errors of {contents}", number / len(parts)))
             predicted = sum(by_section[name] for name in part)
-            measured = self._measure_part(part, planned, outputs, arrays, predicted)
+            measured = self._measure_part(part, planned, arrays, predicted)
             errors[part] = ErrorMeasurement(measured, predicted)
         return errors
-
-    def _plan(self, sensitivity: Sensitivity) -> tuple[Plan, HybridModel, torch.Tensor]:
-        """Return a plan, the planned model and its `geometry_outputs()`.
-
-        They are made again only if the sensitivities of positions changed.
-        """
-        if self._last_plan is None or not np.array_equal(self._last_plan[0], sensitivity.positions):
-            plan = make_plan(self.model, sensitivity, self.distortion, self.prune)
-            planned = plan.apply(self.model)
-            self._last_plan = sensitivity.positions, plan, planned, planned.geometry_outputs()
-        return self._last_plan[1:]
 
     def _measure_part(
         self,
         part: Part,
-        planned: HybridModel,
-        planned_outputs: torch.Tensor,
+        planned: PlannedModel,
         arrays: dict[str, np.ndarray],
         predicted: float,
     ) -> float:
         """Measure the error of the pruned model with the quantised numbers `arrays` of one part, or on the lattice."""
         if part == (POSITIONS,):
-            decoded = planned.add_shading(planned.geometry_from_outputs(planned_outputs))
-            return self.references.measure_error(planned, decoded, predicted=predicted)
+            decoded = planned.model.add_shading(planned.model.geometry_from_outputs(planned.geometry_outputs))
+            return self.references.measure_error(planned.model, decoded, predicted=predicted)
         changed = _replace_arrays(self.pruned, {name: arrays[name] for name in part})
+        if part == (COLORS,) and self.pruned.gaussians.color_residuals is None:
+            change = changed.gaussians.color_logits - self.pruned.gaussians.color_logits
+            shifted = self.references.shift_color_logits(change)
+            return self.references.measure_error(changed, Decoded(self.geometry, shading=None), shifted, predicted)
         colors = None if COLOR_SECTIONS.intersection(part) else self.references.colors
         decoded = decode_changed(changed, part, self.geometry, self.geometry_outputs)
         return self.references.measure_error(changed, decoded, colors, predicted)
@@ -210,15 +200,16 @@ def _predict_quantization_errors(
         weights[group] = residual_sensitivity(s, group, columns).ravel()
     # Positions are uniform within their lattice cell: variance 1/12 of the squared step for each of the three axes.
     bits = np.concatenate([layer.points.bits[layer.points.classes] for layer in plan.layers])
-    errors = {POSITIONS: float((s.positions * 3 / 12 * 4.0**-bits).sum())}
-    for group, values in stored.items():
+    position_error = float((s.positions * 3 / 12 * 4.0**-bits).sum())
+
+    def predict_error(group: str) -> float:
         if group == OPACITIES:
             _, error = opacity_error_model(field_logits, wanted[group][:, 0].astype(np.float64), s.opacities)
-            errors[group] = float(error(slice(None), values[:, 0]).sum())
-        else:
-            difference = values.ravel().astype(np.float64) - wanted[group].ravel()
-            errors[group] = float((weights[group] * difference**2).sum())
-    return errors
+            return float(error(slice(None), stored[group][:, 0]).sum())
+        difference = stored[group].ravel().astype(np.float64) - wanted[group].ravel()
+        return float((weights[group] * difference**2).sum())
+
+    return {POSITIONS: position_error, **run_jobs({group: partial(predict_error, group) for group in stored})}
 
 
 def _undo_plan_order(quantized: QuantizedModel) -> dict[str, np.ndarray]:

@@ -75,6 +75,16 @@ class ReferenceRenders:
         """Return the colours (n, 3) in each view of the Gaussians at `index` (n,)."""
         return [colors[torch.as_tensor(index, device=colors.device)] for colors in self.colors]
 
+    def shift_color_logits(self, change: Tensor) -> list[Tensor]:
+        """Return the colours (N, 3) in each view after a change (N, 3) of the explicit colour logits.
+
+        The colours must be sigmoids of logits, as those of a model without colour residuals. A change d of the logit
+        of a colour c multiplies its odds c / (1 - c) by r = exp(d), so the new colour is r c / (1 + (r - 1) c).
+        """
+        ratio = change.exp()
+        device = change.device
+        return parallel_map(lambda colors: ratio * colors / (1 + (ratio - 1) * colors), self.colors, device)
+
     def measure_error(
         self,
         model: HybridModel,

@@ -13,6 +13,7 @@ from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB, default_distortio
 from hyrfpack.compress.limits import EncodedCandidate, encode_within_bytes, encode_within_psnr_drop
 from hyrfpack.compress.merged import MergedPacker, compress_parts, is_merged, iterate_parts, mask_scene_views, name_part
 from hyrfpack.compress.packer import Packer
+from hyrfpack.compress.planner import Planner
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.report import CompressionReport
 from hyrfpack.compress.sensitivity import Sensitivity
@@ -232,7 +233,10 @@ def _prepare_packer(
     _LOG.info(f"measuring how each stored number affects renders, at {len(cameras)} cameras and between them")
     steps = config.finetune_steps or 0
     start = config.distortion or default_distortion(provenance, steps)
-    sensitivity, references = measure_calibrated_sensitivity(model, cameras, start, config.prune, measuring_progress)
+    planner = Planner(model, config.prune)
+    sensitivity, references = measure_calibrated_sensitivity(
+        model, cameras, start, config.prune, measuring_progress, planner=planner
+    )
     # The model of a uniform wall or sky may be all background, at cameras that are known to be its own.
     has_own_cameras = data is None or ("cameras" in provenance and not capture.mismatch)
     if not sensitivity.is_seen and not (model.config.background and has_own_cameras):
@@ -242,7 +246,7 @@ def _prepare_packer(
         )
     sensitivity = ranks.broadcast(sensitivity)  # on GPUs the other ranks' values differ in their last bits
     cache = context.cache or PictureCache()
-    packer = Packer(model, kept, sensitivity, data, steps, config.prune, encoding_progress, cache, ranks)
+    packer = Packer(model, kept, sensitivity, data, steps, config.prune, encoding_progress, cache, ranks, planner)
     return packer, references, start
 
 

@@ -20,13 +20,15 @@ from hyrfpack.compress.part_errors import (
     predict_errors,
 )
 from hyrfpack.compress.plan import make_plan
+from hyrfpack.compress.planner import Planner
 from hyrfpack.compress.quantize import field_opacity_logits, plan_and_quantize
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.sensitivity import PRUNED_KEY, Sensitivity, measure_sensitivity
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.arrays import iter_parameters, to_arrays
-from hyrfpack.format.sections import COLORS, OPACITIES, POSITIONS, RESIDUAL_SECTIONS
+from hyrfpack.format.sections import COLORS, OPACITIES, POSITIONS, RESIDUAL_SECTIONS, SCALES
 from hyrfpack.model import HybridModel
+from hyrfpack.render.in_view import colors_in_view
 from tools.safety.make_golden import add_golden_residuals
 
 CALIBRATION_CAMERAS = ring(8, width=48, height=48)
@@ -227,6 +229,40 @@ def test_updating_changed_parts_equals_decoding_the_whole_model(part, decoder_sc
 
     expected = references.measure_error(changed)
     assert measured == pytest.approx(expected, rel=1e-3) and (expected > 1e-7 or not decoder_scale)
+
+
+def test_colours_after_a_change_of_logits_equal_those_of_the_changed_model(model):
+    references, changed = ReferenceRenders.from_model(model, CALIBRATION_CAMERAS), deepcopy(model)
+    change = torch.from_numpy(np.random.default_rng(1).normal(0, 2, size=(len(model), 3)).astype(np.float32))
+    changed.gaussians.color_logits.data += change
+
+    shifted = references.shift_color_logits(change)
+
+    for ours, view in zip(shifted, references.views, strict=True):
+        torch.testing.assert_close(ours, colors_in_view(changed, view, changed.decode()), rtol=0, atol=1e-5)
+
+
+def test_a_plan_is_made_again_only_if_it_would_differ(model, first_order):
+    planner = Planner(model)
+    planned = planner.plan(first_order, 1e-4)
+
+    assert planner.plan(first_order.scaled_by({COLORS: 3.0, OPACITIES: 0.2}), 1e-4) is planned
+    for factors, distortion in (({POSITIONS: 4.0}, 1e-4), ({PRUNED_KEY: 0.1}, 1e-4), ({}, 1e-3)):
+        other = first_order.scaled_by(factors)
+        again, expected = planner.plan(other, distortion), make_plan(model, other, distortion)
+        np.testing.assert_array_equal(again.plan.kept, expected.kept)
+        np.testing.assert_array_equal(again.plan.layers[0].points.bits, expected.layers[0].points.bits)
+        assert again.plan.distortion_per_number == expected.distortion_per_number
+        torch.testing.assert_close(again.geometry_outputs, expected.apply(model).geometry_outputs())
+
+
+def test_a_plan_does_not_depend_on_factors_of_colours_scales_and_opacities(model, first_order):
+    other = first_order.scaled_by({COLORS: 3.0, OPACITIES: 0.2, SCALES: 50.0})
+
+    plan, expected = make_plan(model, other, 1e-4), make_plan(model, first_order, 1e-4)
+
+    np.testing.assert_array_equal(plan.kept, expected.kept)
+    np.testing.assert_array_equal(plan.layers[0].points.cells, expected.layers[0].points.cells)
 
 
 def test_renders_of_some_gaussians_use_the_colours_of_all(model):

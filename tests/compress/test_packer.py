@@ -361,10 +361,10 @@ def test_without_photos_the_stored_cameras_and_the_stored_psnr_are_used(ball_fil
     """The stored cameras equal those of the photos to nine digits."""
     poses, distortions = [], []
 
-    def measure_and_record(model, cameras, distortion, *rest):
+    def measure_and_record(model, cameras, distortion, *rest, **settings):
         poses.append([camera.camera_from_world for camera in cameras])
         distortions.append(distortion)
-        return measure_calibrated_sensitivity(model, cameras, distortion, *rest)
+        return measure_calibrated_sensitivity(model, cameras, distortion, *rest, **settings)
 
     monkeypatch.setattr(run, "measure_calibrated_sensitivity", measure_and_record)
     compress_model(ball_file, tmp_path / "small.hyrf")
