@@ -56,17 +56,20 @@ def measure_calibrated_sensitivity(
         HyrfError: a number of the model is NaN or infinite.
     """
     progress(TaskEvent("rendering reference views", 0.0))
-    references = ReferenceRenders.from_model(model, cameras)
+    outputs = model.geometry_outputs()
+    geometry = model.geometry_from_outputs(outputs)
+    references = ReferenceRenders.from_model(model, cameras, model.add_shading(geometry))
     measuring, calibrating = part_of_progress(progress, 0.05, 0.55), part_of_progress(progress, 0.55, 1.0)
     # The sensitivities are not kept in a variable, so that their memory is free once they are scaled.
     calibrated = calibrate(
         model,
-        measure_sensitivity(model, cameras, progress=measuring, drawn=drawn),
+        measure_sensitivity(model, cameras, progress=measuring, drawn=drawn, geometry=geometry),
         references,
         distortion,
         prune,
         calibrating,
         planner,
+        outputs,
     )
     return calibrated, replace(references, colors=[])  # Colours take memory, and only calibration uses them.
 
@@ -81,6 +84,7 @@ def calibrate(
     prune: bool = True,
     progress: Progress = ignore_progress,
     planner: Planner | None = None,
+    outputs: torch.Tensor | None = None,
 ) -> Sensitivity:
     """Scale sensitivities so that they predict the error measured on renders, for plans of about this distortion.
 
@@ -90,13 +94,14 @@ def calibrate(
         distortion, prune: as `make_plan` takes them.
         progress: called with `TaskEvent`s.
         planner: as `measure_calibrated_sensitivity` takes it.
+        outputs: (N, 8) the result of `model.geometry_outputs()`, if it is known.
 
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
     if not sensitivity.is_seen:
         return sensitivity
-    outputs = model.geometry_outputs()
+    outputs = model.geometry_outputs() if outputs is None else outputs
     geometry = model.geometry_from_outputs(outputs)
     # Pruning is calibrated first, because the errors of the other parts depend on which Gaussians are left.
     if prune:

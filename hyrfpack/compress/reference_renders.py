@@ -44,13 +44,18 @@ class ReferenceRenders:
     colors: list[Tensor]
 
     @classmethod
-    def from_model(cls, model: HybridModel, cameras: Sequence[Camera]) -> ReferenceRenders:
-        """Render a model, half of the views at some of its cameras and half between them."""
+    def from_model(
+        cls, model: HybridModel, cameras: Sequence[Camera], decoded: Decoded | None = None
+    ) -> ReferenceRenders:
+        """Render a model, half of the views at some of its cameras and half between them.
+
+        `decoded` is the result of `model.decode()`, if it is known.
+        """
         views = COMPARISON_DRAWN_GAUSSIANS // max(len(model), 1)
         count = int(np.clip(views, MIN_COMPARISON_VIEWS, MAX_COMPARISON_VIEWS)) // 2
         # Another seed than that of sensitivities gives other views between the cameras.
         at, between = sample_views(cameras, count, seed=1)
-        return cls.from_views([*at, *between], model)
+        return cls.from_views([*at, *between], model, decoded)
 
     @classmethod
     def from_views(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import nn
 
 from hyrfpack.cameras.view_sampling import Windows, sample_views, sample_windows
 from hyrfpack.format.arrays import SECTION_PARAMETERS
@@ -21,8 +23,10 @@ from hyrfpack.format.sections import (
     TABLE_SECTIONS,
 )
 from hyrfpack.model import Geometry, HybridModel, expand
+from hyrfpack.model.field import Field
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.parallel.pool import map_row_blocks, torch_on_one_thread
+from hyrfpack.parallel.pool import map_row_blocks, parallel_map, torch_on_one_thread
+from hyrfpack.parallel.threads import thread_count
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import render_view
 from hyrfpack.render.in_view import gaussians_in_view
@@ -118,6 +122,7 @@ def measure_sensitivity(
     seed: int = 0,
     progress: Progress = ignore_progress,
     drawn: int = TARGET_DRAWN_GAUSSIANS,
+    geometry: Geometry | None = None,
 ) -> Sensitivity:
     """Estimate the mean squared derivatives of pictures with respect to every number of a model.
 
@@ -135,59 +140,109 @@ def measure_sensitivity(
         seed: random seed of the signs, which a device draws itself, and of the views between cameras.
         progress: called with `TaskEvent`s.
         drawn: about how many Gaussians are drawn in all views together; more make the measurement less noisy.
+        geometry: the geometry of all Gaussians, if it is known.
 
     Raises:
         HyrfError: a number of the model is NaN or infinite.
     """
     windows = choose_windows(cameras, len(model), drawn, seed)
-    views, are_pictures = windows.views, windows.columns * windows.rows == 1
+    views, positions = windows.views, model.gaussians.positions
     field_interval = max(1, round(1 / FIELD_VIEW_SHARE))
-    generator = torch.Generator(model.gaussians.positions.device).manual_seed(seed)
+    generator = torch.Generator(positions.device).manual_seed(seed)
     squares = {name: torch.zeros_like(parameter) for name, parameter in model.named_parameters()}
     squares |= {f"gaussians.{name}": torch.zeros_like(values) for name, values in _residuals(model).items()}
     jacobian = _cube_jacobian(model)
+    frozen_fields = _freeze(model.geometry), _freeze(model.radiance)
     required = {name: parameter.requires_grad for name, parameter in model.named_parameters()}
-    pixels, field_pixels = 0, 0
+    pixels, field_pixels, is_window = 0, 0, windows.columns * windows.rows > 1
+
+    def measure(job: tuple[Camera, torch.Tensor, tuple[Field, Field] | None]):
+        return _square_gradients(model, *job, is_window=is_window, jacobian=jacobian)
+
+    # Each thread measures a whole view, and sums are made in the order of views.
+    views_at_once = thread_count() if positions.device.type == "cpu" else 1
     try:
-        for number, camera in enumerate(views):
-            progress(TaskEvent(f"measuring sensitivities, view {number + 1}/{len(views)}", number / len(views)))
-            # Views at and between cameras alternate, so both kinds are among the views of the fields.
-            with_fields = number % (2 * field_interval) < 2
-            for name, parameter in model.named_parameters():
-                parameter.requires_grad_(with_fields or name.startswith("gaussians."))
-                parameter.grad = None
-            # A window renders only the Gaussians that it can show, so that gradients of the others take no memory.
-            index: slice | torch.Tensor = slice(None)
-            shown = model
-            if not are_pictures:
-                index = _indices_in_view(model, camera)
-                shown = model.subset(index)
-            residuals = _residuals(shown)
-            for values in residuals.values():
-                values.requires_grad_(True)
-            rgb = render_view(shown, camera).rgb
-            signs = draw_signs(rgb, generator)
-            if rgb.requires_grad:
-                (rgb * signs).sum().backward()
-            pixels += rgb.numel()
-            field_pixels += rgb.numel() * with_fields
-            for name, values in (*shown.named_parameters(), *shown.named_buffers()):
-                gradient, values.grad = values.grad, None
-                if gradient is None:
-                    continue
-                if name == "gaussians.positions":
-                    gradient = (jacobian[index] * gradient[:, :, None]).sum(1)
-                if name.startswith("gaussians."):
-                    squares[name][index] += gradient.square()
-                else:
-                    squares[name] += gradient.square()
-            for values in residuals.values():
-                values.requires_grad_(False)
+        for values in (*model.parameters(), *_residuals(model).values()):
+            values.requires_grad_(True)
+        for first in range(0, len(views), views_at_once):
+            jobs = []
+            for number, camera in enumerate(views[first : first + views_at_once], first):
+                progress(TaskEvent(f"measuring sensitivities, view {number + 1}/{len(views)}", number / len(views)))
+                signs = draw_signs(positions.new_empty(camera.height, camera.width, 3), generator)
+                # Views at and between cameras alternate, so both kinds are among the views of the fields.
+                with_fields = number % (2 * field_interval) < 2
+                pixels += signs.numel()
+                field_pixels += signs.numel() * with_fields
+                jobs.append((camera, signs, None if with_fields else frozen_fields))
+            for index, added in parallel_map(measure, jobs, positions.device):
+                for name, values in added.items():
+                    if name.startswith("gaussians."):
+                        squares[name][index] += values
+                    else:
+                        squares[name] += values
     finally:
         for name, parameter in model.named_parameters():
             parameter.requires_grad_(required[name])
+        for values in _residuals(model).values():
+            values.requires_grad_(False)
     at, _ = sample_views(cameras, len(views) // 2, seed)
-    return _combine(model, squares, pixels, field_pixels, at, windows.pictures, jacobian)
+    with torch.no_grad():
+        geometry = model.decode_geometry() if geometry is None else geometry
+    return _combine(model, geometry, squares, pixels, field_pixels, at, windows.pictures, jacobian)
+
+
+@torch.enable_grad()
+def _square_gradients(
+    model: HybridModel,
+    camera: Camera,
+    signs: torch.Tensor,
+    fields: tuple[Field, Field] | None,
+    *,
+    is_window: bool,
+    jacobian: torch.Tensor,
+) -> tuple[slice | torch.Tensor, dict[str, torch.Tensor]]:
+    """Return the squared derivatives of a view, times signs, with respect to the numbers of a model.
+
+    Args:
+        camera: the view.
+        signs: (H, W, 3) from `draw_signs`.
+        fields: geometry and radiance field to render with, which get no derivatives; None for those of the model.
+        is_window: whether the view shows few of the Gaussians. Then only these are rendered, so that derivatives of the
+            others take no memory.
+        jacobian: (N, 3, 3) from `_cube_jacobian`.
+
+    Returns:
+        The index of the Gaussians that were rendered, and the squares by parameter or buffer.
+    """
+    index: slice | torch.Tensor = slice(None)
+    gaussians = model.gaussians
+    if is_window:
+        index = _indices_in_view(model, camera)
+        gaussians = gaussians.subset(index)
+    shown = model.with_gaussians(gaussians)
+    if fields is not None:
+        shown.geometry, shown.radiance = fields
+    wanted: dict[str, torch.Tensor] = {
+        name: values for name, values in shown.named_parameters() if values.requires_grad
+    }
+    wanted |= {f"gaussians.{name}": values.requires_grad_(True) for name, values in _residuals(shown).items()}
+    rgb = render_view(shown, camera).rgb
+    if not rgb.requires_grad:
+        return index, {}
+    gradients = torch.autograd.grad((rgb * signs).sum(), list(wanted.values()), allow_unused=True)
+    squares = {}
+    for name, gradient in zip(wanted, gradients, strict=True):
+        if gradient is not None:
+            if name == "gaussians.positions":
+                gradient = (jacobian[index] * gradient[:, :, None]).sum(1)
+            squares[name] = gradient.square()
+    return index, squares
+
+
+def _freeze(field: Field) -> Field:
+    """Return a copy of a field with the same numbers, in the same memory, that gets no gradients."""
+    shared = {id(values): nn.Parameter(values.detach(), requires_grad=False) for values in field.parameters()}
+    return deepcopy(field, shared)
 
 
 def draw_signs(image: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
@@ -226,6 +281,7 @@ def choose_windows(
 @torch.no_grad()
 def _combine(
     model: HybridModel,
+    geometry: Geometry,
     squares: dict[str, torch.Tensor],
     pixels: int,
     field_pixels: int,
@@ -234,7 +290,6 @@ def _combine(
     jacobian: torch.Tensor,
 ) -> Sensitivity:
     """Average the accumulated squared gradients, combine them with the prior estimate, and apply lower bounds."""
-    geometry = model.decode_geometry()
     expected, cells = _expected_sensitivity(model, geometry, cameras, jacobian), prior_cells(model)
     explicit = []
     for name, guess in expected.items():
