@@ -166,7 +166,7 @@ class HybridModel(nn.Module):
 
         The result takes 4 (hidden + 8) bytes per Gaussian, or 2 hidden + 32 with mixed precision on a GPU.
         """
-        return self.add_shading(self.decode_geometry())
+        return self.add_shading(self.geometry_from_outputs(self.geometry_outputs()))
 
     @torch.no_grad()
     def add_shading(self, geometry: Geometry) -> Decoded:
@@ -217,7 +217,23 @@ class HybridModel(nn.Module):
         explicit = self.gaussians
         if explicit.shape_residuals is not None:
             outputs = add_shape_residuals(outputs, explicit.shape_residuals)
-        return self.activate(outputs, explicit.positions, explicit.scale_logits, explicit.opacity_logits)
+        inputs = outputs, explicit.positions, explicit.scale_logits, explicit.opacity_logits
+        if outputs.device.type != "cpu":
+            return self.activate(*inputs)
+        geometry = Geometry(
+            outputs.new_empty(len(self), 3), outputs.new_empty(len(self), 4), outputs.new_empty(len(self))
+        )
+        count = GAUSSIANS_PER_FIELD_BLOCK["cpu"]
+
+        @torch.no_grad()
+        def fill(start: int) -> None:
+            rows = slice(start, start + count)
+            block = self.activate(*(values[rows] for values in inputs))
+            geometry.scales[rows], geometry.quats[rows] = block.scales, block.quats
+            geometry.opacities[rows] = block.opacities
+
+        parallel_map(fill, range(0, len(self), count))
+        return geometry
 
     def decode_geometry(self, index: Tensor | None = None, used: Tensor | None = None) -> Geometry:
         """Return scales, rotations and opacities of the Gaussians at `index` (n,) int64, or of all.
