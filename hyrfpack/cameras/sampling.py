@@ -96,27 +96,31 @@ class PhotoCameras:
         """
         if not self.cameras:
             return None
+        from hyrfpack.parallel.pool import parallel_map  # imports torch, which cameras do without
+
         sizes = np.empty(len(points), np.float32)
-        with np.errstate(all="ignore"):
-            self._fill_pixel_sizes(sizes, points, np.array(center), scale, axes)
+
+        def fill(start: int) -> None:
+            block = slice(start, start + _POINTS_PER_BLOCK)
+            with np.errstate(all="ignore"):  # which is kept per thread
+                sizes[block] = 1 / self._highest_rates(points[block], np.array(center), scale, axes)
+
+        parallel_map(fill, range(0, len(points), _POINTS_PER_BLOCK))
         sizes /= np.float32(self.rate_ratio)
         sizes[~(sizes <= MAX_PIXEL_SIZE)] = 0  # also where NaN
         return sizes
 
-    def _fill_pixel_sizes(
-        self, sizes: np.ndarray, points: np.ndarray, origin: np.ndarray, scale: float, axes: np.ndarray
-    ) -> None:
-        """Write the inverse of the highest rates (N,) at points (N, 3) to `sizes`."""
-        for start in range(0, len(points), _POINTS_PER_BLOCK):
-            block = np.ascontiguousarray(points[start : start + _POINTS_PER_BLOCK].T)
-            best = np.zeros(block.shape[1], np.float32)
-            for camera in self.cameras:
-                np.maximum(best, _sampling_rates(camera, block, origin, scale, axes), out=best)
-            unseen = np.flatnonzero(best == 0)
-            if len(unseen):
-                distant = [_rates_by_distance(camera, block[:, unseen], origin, scale, axes) for camera in self.cameras]
-                best[unseen] = np.max(distant, axis=0)
-            sizes[start : start + len(best)] = 1 / best
+    def _highest_rates(self, points: np.ndarray, origin: np.ndarray, scale: float, axes: np.ndarray) -> np.ndarray:
+        """Return the highest rates (n,) at points (n, 3)."""
+        planes = np.ascontiguousarray(points.T)
+        best = np.zeros(len(points), np.float32)
+        for camera in self.cameras:
+            np.maximum(best, _sampling_rates(camera, planes, origin, scale, axes), out=best)
+        unseen = np.flatnonzero(best == 0)
+        if len(unseen):
+            distant = [_rates_by_distance(camera, planes[:, unseen], origin, scale, axes) for camera in self.cameras]
+            best[unseen] = np.max(distant, axis=0)
+        return best
 
 
 def stored_rate_ratio(provenance: dict, default: float = 1.0) -> float:
