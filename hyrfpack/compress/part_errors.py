@@ -217,12 +217,14 @@ def _undo_plan_order(quantized: QuantizedModel) -> dict[str, np.ndarray]:
 
     So the decoded values of that model can be used for the parts that did not change.
     """
-    order = np.argsort(quantized.plan.kept)
-    arrays = quantized.arrays()
-    return {
-        name: values[order] if name in (*LOGIT_SECTIONS, *RESIDUAL_SECTIONS) else values
-        for name, values in arrays.items()
-    }
+    kept, arrays = quantized.plan.kept, quantized.arrays()
+
+    def undo(name: str) -> np.ndarray:
+        values = arrays[name]
+        return values[order] if name in (*LOGIT_SECTIONS, *RESIDUAL_SECTIONS) else values
+
+    order = np.argsort(kept)
+    return run_jobs({name: partial(undo, name) for name in arrays})
 
 
 def _replace_arrays(model: HybridModel, arrays: dict[str, np.ndarray]) -> HybridModel:
@@ -244,5 +246,5 @@ def decode_changed(model: HybridModel, part: Part, geometry: Geometry, geometry_
     if COLOR_SECTIONS.intersection(part):
         return model.add_shading(geometry)
     if GEOMETRY_TABLE in part:
-        return Decoded(model.decode_geometry(), shading=None)
+        return Decoded(model.geometry_from_outputs(model.geometry_outputs()), shading=None)
     return Decoded(model.geometry_from_outputs(geometry_outputs), shading=None)

@@ -68,13 +68,15 @@ def quantize(
     Raises:
         HyrfError: a parameter is NaN or infinite.
     """
-    arrays = {group: values.astype(np.float64) for group, values in to_arrays(model).items() if group in sections}
+    arrays = {group: values for group, values in to_arrays(model).items() if group in sections}
     sensitivity, d = sensitivity.subset(plan.kept), plan.distortion_per_number
     jobs: dict[str, Callable[[], Any]] = {
         group: partial(quantize_groups, arrays[group].ravel(), groups, sensitivity.fields[group], d, reach)
         for group, groups in plan.groups.items()
         if group in sections
     }
+    for group in arrays.keys() & {*LOGIT_SECTIONS, *RESIDUAL_SECTIONS}:
+        arrays[group] = arrays[group].astype(np.float64)
     residuals = [group for group in residual_widths(model.config) if group in sections]
     if HARMONICS in residuals:
         arrays[HARMONICS] = split_colors(arrays[HARMONICS], plan.basis)

@@ -78,7 +78,8 @@ class ReferenceRenders:
 
     def colors_of(self, index: np.ndarray) -> list[Tensor]:
         """Return the colours (n, 3) in each view of the Gaussians at `index` (n,)."""
-        return [colors[torch.as_tensor(index, device=colors.device)] for colors in self.colors]
+        rows = torch.as_tensor(index, device=self.pictures[0].device)
+        return parallel_map(lambda colors: colors.index_select(0, rows), self.colors, rows.device)
 
     def shift_color_logits(self, change: Tensor) -> list[Tensor]:
         """Return the colours (N, 3) in each view after a change (N, 3) of the explicit colour logits.
