@@ -26,7 +26,7 @@ MIN_COMPARISON_VIEWS = 6
 MAX_COMPARISON_VIEWS = 10
 # If the errors in two views are both higher, or both lower, than their prediction by more than this factor, the others
 # are not measured: the prediction is then corrected by far more than the errors of views differ.
-MAX_ROUGH_ERROR_RATIO = 16.0
+MAX_ROUGH_ERROR_RATIO = 6.0
 
 
 @dataclass(frozen=True)
