@@ -165,6 +165,7 @@ def _encode_merged(
             )
         start = start or distortion  # that of the scene
         names.append(name)
+        packer.planner = None  # so that the plans of all parts are not in memory together
         packers.append(packer)
     merged = MergedPacker(names, packers)
     searching = part_of_progress(progress, SEARCH_ENCODING_START_SHARE, 1.0)
@@ -246,7 +247,8 @@ def _prepare_packer(
         )
     sensitivity = ranks.broadcast(sensitivity)  # on GPUs the other ranks' values differ in their last bits
     cache = context.cache or PictureCache()
-    packer = Packer(model, kept, sensitivity, data, steps, config.prune, encoding_progress, cache, ranks, planner)
+    last_planner = None if steps else planner  # Fine-tuning moves Gaussians, so the last plan is of no use to it.
+    packer = Packer(model, kept, sensitivity, data, steps, config.prune, encoding_progress, cache, ranks, last_planner)
     return packer, references, start
 
 
