@@ -81,7 +81,7 @@ def count_step_work(points: int, side: int, *, replayed: bool = False) -> WorkCo
         patch.setattr("hyrfpack.ops.hash_encode.gpu._POINTS_PER_THREAD", 1)
         trainer = Trainer(scene, config, device=gpu)
         if not replayed:
-            trainer.replays_steps = False
+            trainer.renderer.replays_steps = False
         with listen_to_gpu(listen):
             trainer.run(stop=lambda: trainer.step > counted_step)
     assert trainer.step > counted_step and len(trainer.model) == points

@@ -84,7 +84,7 @@ def test_training_agrees_with_the_cpu(gpu):
 def test_recorded_steps_train_as_launched_ones(gpu, caplog):
     config = dataclasses.replace(TRAIN_CONFIG, steps=12, density=DensityConfig(start=1.0, stop=1.0, rounds=1))
     recorded, launched = (Trainer(make_scene(), config, device=gpu) for _ in range(2))
-    launched.replays_steps = False
+    launched.renderer.replays_steps = False
     with caplog.at_level(logging.WARNING):
         found = record_curve(recorded)
     assert recorded.seconds["replay"] > 0 and not caplog.records

@@ -18,39 +18,31 @@ from torch import Tensor, nn
 from hyrfpack.checks import check_float, check_int
 from hyrfpack.config.train import FIELD_WARMUP_STEPS, TrainConfig
 from hyrfpack.data import PictureCache
-from hyrfpack.device import Photos, upload_array
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.measure.stages import add_seconds
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.ops.dispatch import GPU_OPERATIONS, replaced_operations
 from hyrfpack.ops.transfer import HostCopy
-from hyrfpack.ops.viewport import PackedCamera
 from hyrfpack.out_of_memory import explain_out_of_memory, has_run_out_of_memory
 from hyrfpack.parallel.pool import freed_memory_kept, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import StepEvent, ignore_progress
-from hyrfpack.render import RenderSettings
-from hyrfpack.render.renderer import pack_camera
-from hyrfpack.render.reserve import Reserve, can_reserve
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train.checkpoint import damaged_checkpoint, load_checkpoint, names_and_sizes, save_checkpoint
 from hyrfpack.train.density import DensityControl
 from hyrfpack.train.distributed import StepStats, average_gradients, check_settings, digest, pack_step_stats
 from hyrfpack.train.exposure import initialize_exposures
-from hyrfpack.train.gradients import StepInputs, StepShape, ViewGradients, compute_gradients
 from hyrfpack.train.launched import ConfirmedStep, LaunchedStep, RenderedView
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.provenance import training_background_spacing
-from hyrfpack.train.reserves import ReserveEstimator
 from hyrfpack.train.resolution import ResolutionSchedule
 from hyrfpack.train.setup import build_model, check_has_photos, usual_budget_for
 from hyrfpack.train.spacing import gaussian_spacing
 from hyrfpack.train.step_checks import MAX_GRADIENT
-from hyrfpack.train.step_graphs import StepGraphs
 from hyrfpack.train.strategy import Strategy
+from hyrfpack.train.view_renderer import ViewRenderer
 from hyrfpack.version import __version__
 
 _LOG = logging.getLogger(__name__)
@@ -86,8 +78,7 @@ class Trainer:
         spacing: distance between the initial Gaussians in local units, see `gaussian_spacing`.
         learning_rates: those of `config`, adapted to this spacing (`LearningRates.at_spacing`).
         kind: "pilot run" (`hyrfpack.train.pilots`), "first look" (`hyrfpack.make`), or empty for the run itself.
-        replays_steps: whether a GPU replays captured steps (`hyrfpack.train.step_graphs`). If False, the host launches
-            each step, as it does for several processes and for models that need more than kernels.
+        renderer: renders the training views and computes their gradients.
 
     Example:
         >>> trainer = Trainer(scene, TrainConfig(steps=2000))
@@ -124,7 +115,6 @@ class Trainer:
         self.config = config
         self.cache = cache or PictureCache()
         self.device = device
-        self.photos = Photos(device)
         self.choices: dict[str, str] = {}  # For each setting, the choice and its reason.
         self.pilots: list[dict] = []  # The scores of the pilot runs, see `PilotScore`.
         self._warmup_steps = FIELD_WARMUP_STEPS if model is None else 0
@@ -140,13 +130,17 @@ class Trainer:
             _check_trainable(model)
             self.budget = config.max_gaussians or len(model)
             self.spacing = gaussian_spacing(model, scene.train, usual_budget)
-        self._reserves, self._reserves_memory = ReserveEstimator(), can_reserve(device) and ranks.is_single
-        self.replays_steps = self._reserves_memory and _can_capture(model)
-        self._graphs = StepGraphs()
-        self._packed_cameras: dict[tuple[str, RenderSettings, int], PackedCamera] = {}
         self.exposures, self.choices["exposure"] = initialize_exposures(scene, config, self.cache, device, ranks)
+        self.renderer = ViewRenderer(
+            scene.train,
+            config,
+            self.exposures,
+            device,
+            is_single_process=ranks.is_single,
+            has_position_gradients=model.config.position_gradients,
+        )
         self.learning_rates = config.learning_rates.at_spacing(self.spacing)
-        self._take(model)
+        self._begin_to_optimize(model)
         self.strategy: Strategy = strategy or DensityControl(
             config.density, self.steps, self.budget, len(self.model), config.seed, device, ranks
         )
@@ -159,8 +153,8 @@ class Trainer:
         self.seconds: dict[str, float] = defaultdict(float)  # By stage, summed over all parts of a resumed run.
         self.elapsed = 0.0
 
-    def _take(self, model: HybridModel) -> None:
-        """Replace the trained model and start a new optimiser for it."""
+    def _begin_to_optimize(self, model: HybridModel) -> None:
+        """Make `model` the model that is trained, with a new optimiser."""
         model.precision = self.config.precision
         model.gaussians.pixel_sizes = None  # They belong to the Gaussians of a file, which training moves and replaces.
         model.background_spacing = training_background_spacing(self.scene)  # Scores are then those of the model's file.
@@ -168,7 +162,7 @@ class Trainer:
             model.requires_grad_(True)
         self.model = model.to(self.device)
         self.optimizer = Optimizer(self.model, self.learning_rates, self.ranks.size, self._warmup_steps)
-        self._graphs.clear()
+        self.renderer.graphs.clear()
 
     # -- the loop ------------------------------------------------------------------------------------------------
 
@@ -238,7 +232,7 @@ class Trainer:
         try:
             yield
         finally:
-            self._graphs.release()
+            self.renderer.graphs.release()
 
     def _order(self) -> Iterator[View]:
         """Return an iterator over this rank's views of the remaining steps, at the resolutions of these steps."""
@@ -278,7 +272,7 @@ class Trainer:
         try:
             with explain_out_of_memory(OUT_OF_MEMORY_FIX), add_seconds(self.seconds, "data"):
                 view, picture = next(views)
-            rendered = self._gradients(self.step, view, picture)
+            rendered = self._compute_gradients(self.step, view, picture)
         except HyrfError as refusal:
             if self.ranks.is_single:
                 raise
@@ -286,16 +280,16 @@ class Trainer:
         confirmed += self._confirm_launched()
         if any(stats.was_retaken for stats in confirmed):  # These gradients are those of an older model.
             self._discard_gradients()
-            rendered = self._gradients(self.step, view, picture)
+            rendered = self._compute_gradients(self.step, view, picture)
         self._update(self.step, rendered, stop, problem)
         rendered = None  # Otherwise its gradients would be kept until the next step.
         is_acting = self.strategy.acting(self.step)
-        if confirm or is_acting or not self._reserves_memory:
+        if confirm or is_acting or self.renderer.reserves is None:
             confirmed += self._confirm_launched(problem)
         if is_acting:
             with add_seconds(self.seconds, "density"):
                 before = self.model.gaussians.positions
-                self._graphs.clear()  # They hold the addresses of parameters.
+                self.renderer.graphs.clear()  # They hold the addresses of parameters.
                 self.strategy.act(self.step, self.model, self.optimizer)
                 self.resolution.update(self.step, len(self.model))
                 if not self.ranks.is_single and self.model.gaussians.positions is not before:
@@ -303,60 +297,32 @@ class Trainer:
         return confirmed
 
     @explain_out_of_memory(OUT_OF_MEMORY_FIX)
-    def _gradients(self, step: int, view: View, picture: Picture) -> RenderedView:
-        """Render a view for a step, and compute the gradients of its loss."""
-        with add_seconds(self.seconds, "data"):
-            settings = self.resolution.render_settings(view.camera, step)
-            inputs = self._upload_inputs(view, picture, self._solid(step), settings)
-            shape = StepShape(
-                (view.camera.width, view.camera.height),
-                settings,
-                self.strategy.watching(step),
-                inputs.mask is not None,
-                self._estimate_reserve(view),
-                view.camera,
-            )
+    def _compute_gradients(self, step: int, view: View, picture: Picture) -> RenderedView:
+        """Render a view for a step, and set the gradients of its loss."""
+        parameters = self._learnt_parameters()
         try:
-            if self.replays_steps:
-                result = self._graphs.run(self._compute, shape, inputs)
-            else:
-                result = self._compute(shape, inputs)
+            result = self.renderer.compute_gradients(
+                self.model,
+                parameters,
+                view,
+                picture,
+                self._choose_background_color(step),
+                self.resolution.render_settings(view.camera, step),
+                absgrad=self.strategy.watching(step),
+            )
         except HyrfError as error:
             if error.__cause__ is not None and has_run_out_of_memory(error):
                 raise error.__cause__ from None
-            if broken := self._nonfinite_parameters():
-                self._refuse(step, "a number to be rendered is not finite", broken)
+            if names := self._nonfinite_parameters():
+                self._raise_nonfinite(step, "a number to be rendered is not finite", names)
             raise HyrfTrainingError(
                 f"training stopped at step {step} on view '{view.name}': {error.problem}", fix=error.fix
             ) from error
-        for parameter, gradient in zip(self._learnt_parameters(), result.gradients, strict=True):
+        for parameter, gradient in zip(parameters, result.gradients, strict=True):
             parameter.grad = gradient
         for stage, seconds in result.seconds.items():
             self.seconds[stage] += seconds
         return RenderedView(view, picture, result)
-
-    def _compute(self, shape: StepShape, inputs: StepInputs) -> ViewGradients:
-        parameters, ssim_weight = self._learnt_parameters(), self.config.ssim_weight
-        return compute_gradients(self.model, self.exposures, parameters, ssim_weight, shape, inputs)
-
-    def _upload_inputs(self, view: View, picture: Picture, solid: np.ndarray, settings: RenderSettings) -> StepInputs:
-        """Return a photo and what else its gradients are computed from, on the device."""
-        target, mask = self.photos.get(view.load, picture, solid)
-        behind = None if self.model.config.background else upload_array(solid, self.device)
-        row = None if self.exposures is None else self.exposures.row(view)
-        if not self._reserves_memory:
-            return StepInputs(target, mask, behind, row)
-        key = view.name, settings, view.camera.width
-        camera = self._packed_cameras.get(key)
-        if camera is None:
-            camera = self._packed_cameras[key] = pack_camera(self.model, view.camera, settings)
-        return StepInputs(target, mask, behind, row, camera)
-
-    def _estimate_reserve(self, view: View) -> Reserve | None:
-        """Return the memory to render a view into: the same for all views of a size, so that they share a graph."""
-        if not self._reserves_memory:
-            return None
-        return self._reserves.estimate_shared(self.scene.train, view, len(self.model))
 
     def _update(
         self, step: int, rendered: RenderedView | None, stop: Callable[[], bool], problem: HyrfError | None
@@ -417,16 +383,17 @@ class Trainer:
         else:
             valid, nonfinite_positions, in_view, nonfinite_inputs, pairs, *norms = numbers
             if nonfinite_positions or nonfinite_inputs:
-                self._refuse(step, "a number to be rendered is not finite", self._nonfinite_parameters())
-            self._reserves.record(launched.reserved[0], len(self.model), int(in_view), int(pairs))
+                self._raise_nonfinite(step, "a number to be rendered is not finite", self._nonfinite_parameters())
+            assert self.renderer.reserves is not None
+            self.renderer.reserves.record(launched.reserved[0], len(self.model), int(in_view), int(pairs))
             flags = [float(not norm <= MAX_GRADIENT) for norm in norms]
             if not valid and np.isfinite(stats.loss) and not any(flags):
                 self._retake(step, *launched.reserved)
                 return self._confirm_launched(was_retaken=True)
         if not np.isfinite(stats.loss):
-            self._refuse(step, "the loss is not finite", self._nonfinite_parameters())
+            self._raise_nonfinite(step, "the loss is not finite", self._nonfinite_parameters())
         if any(flags):
-            self._refuse(step, "a gradient is not finite", self._groups(flags))
+            self._raise_nonfinite(step, "a gradient is not finite", self._name_groups(flags))
         return [ConfirmedStep(step, stats.loss, stats.error, stats.stop, was_retaken)]
 
     def _retake(self, step: int, view: View, picture: Picture) -> None:
@@ -435,7 +402,7 @@ class Trainer:
         if self.exposures is not None:
             self.exposures.retract_step()
         self._discard_gradients()
-        self._update(step, self._gradients(step, view, picture), lambda: False, None)
+        self._update(step, self._compute_gradients(step, view, picture), lambda: False, None)
 
     def _discard_gradients(self) -> None:
         for parameter in self._learnt_parameters():
@@ -462,7 +429,7 @@ class Trainer:
     def _synchronize(self) -> None:
         """Copy the state of rank 0 to all ranks, if their parameters differ after density control."""
         if len(set(self.ranks.all_gather(digest(self.model.parameters())))) > 1:
-            self._restore(self.ranks.broadcast(self._tensors()))
+            self._restore(self.ranks.broadcast(self._collect_tensors()))
 
     def _record(self, stats: ConfirmedStep) -> None:
         """Add a record of a step to the training curve if `is_recorded`, unless all of its photo is masked."""
@@ -471,14 +438,14 @@ class Trainer:
             record = {"step": stats.step, "loss": stats.loss, "psnr": psnr, "gaussians": len(self.model)}
             self.records.append({**record, "seconds": round(self.elapsed, 3)})
 
-    def _solid(self, step: int) -> np.ndarray:
+    def _choose_background_color(self, step: int) -> np.ndarray:
         """Return the colour (3,) behind transparent pixels of a step's photo, and behind a model without a sphere."""
         if self.config.background_color == "random" and not self.model.config.background:
             number = (step - 1) * self.ranks.size + self.ranks.rank + 1  # The number of the view, from 1.
             return np.random.default_rng((self.config.seed, 1, number)).random(3, dtype=np.float32)
         return np.array(self.model.config.solid, np.float32)
 
-    def _groups(self, flags: Sequence[float]) -> list[str]:
+    def _name_groups(self, flags: Sequence[float]) -> list[str]:
         """Return the names of the parameter groups with a gradient that is not finite."""
         count = len(flags) - (self.exposures is not None)
         return self.optimizer.names(flags[:count]) + ["exposure"] * any(flags[count:])
@@ -486,7 +453,7 @@ class Trainer:
     def _nonfinite_parameters(self) -> list[str]:
         return [name for name, p in self.model.named_parameters() if not torch.isfinite(p).all()]
 
-    def _refuse(self, step: int, what: str, groups: list[str]) -> NoReturn:
+    def _raise_nonfinite(self, step: int, what: str, groups: list[str]) -> NoReturn:
         where = ", ".join(groups) if groups else "none; look at the photo itself"
         views = " or ".join(f"'{view.name}'" for view in self._views_of_step(step))
         raise HyrfTrainingError(
@@ -503,24 +470,24 @@ class Trainer:
             chosen["processes"] = self.ranks.size
         return {**self.config.to_dict(), "views": views, "strategy": type(self.strategy).__qualname__, **chosen}
 
-    def _tensors(self) -> dict[str, Tensor]:
+    def _collect_tensors(self) -> dict[str, Tensor]:
         """Return the tensors of the run's state on the CPU, except the density control observations of each rank."""
         tensors: dict[str, Tensor] = {f"model.{name}": p for name, p in self.model.named_parameters()}
         tensors |= {f"adam.{name}": value for name, value in self.optimizer.state_dict().items()}
         if self.exposures is not None:
             tensors |= {f"exposure.{name}": value for name, value in self.exposures.state_dict().items()}
-        return _on_cpu(tensors)
+        return _copy_to_cpu(tensors)
 
     def _restore(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `_tensors` returned."""
+        """Restore what `_collect_tensors` returned."""
         explicit = [tensors[f"model.gaussians.{name}"] for name in Gaussians.PARAMETER_NAMES]
         model = HybridModel(self.model.config, Gaussians(*explicit))
-        model.load_state_dict(_under("model.", tensors))
+        model.load_state_dict(_select_prefixed("model.", tensors))
         model.exposure = self.model.exposure
-        self._take(model)
-        self.optimizer.load_state_dict(_under("adam.", tensors))
+        self._begin_to_optimize(model)
+        self.optimizer.load_state_dict(_select_prefixed("adam.", tensors))
         if self.exposures is not None:
-            self.exposures.load_state_dict(_under("exposure.", tensors))
+            self.exposures.load_state_dict(_select_prefixed("exposure.", tensors))
 
     def save(self, path: Path, *, overwrite: bool = True) -> None:
         """Write a checkpoint to `path`. All ranks must call this, and rank 0 writes the file.
@@ -528,7 +495,7 @@ class Trainer:
         Raises:
             HyrfError: the file cannot be written, or exists and `overwrite` is False.
         """
-        observed = self.ranks.all_gather(_on_cpu(self.strategy.state_dict()))
+        observed = self.ranks.all_gather(_copy_to_cpu(self.strategy.state_dict()))
 
         def write() -> None:
             self._write_checkpoint(path, observed, overwrite)
@@ -539,7 +506,7 @@ class Trainer:
 
     def _write_checkpoint(self, path: Path, observed: list[dict[str, Tensor]], overwrite: bool) -> None:
         """Write a checkpoint, given the density control observations of each rank."""
-        tensors = self._tensors()
+        tensors = self._collect_tensors()
         for rank, values in enumerate(observed):
             tensors |= {f"{_strategy_prefix(rank)}{name}": value for name, value in values.items()}
         progress = {
@@ -585,7 +552,7 @@ class Trainer:
         self.learning_rates = self.config.learning_rates.at_spacing(self.spacing)
         self._restore(tensors)
         self._launched = None
-        self.strategy.load_state_dict(_under(_strategy_prefix(self.ranks.rank), tensors))
+        self.strategy.load_state_dict(_select_prefixed(_strategy_prefix(self.ranks.rank), tensors))
         self.step, self.records = progress["step"], progress["records"]
         self.saved = self.step
         self.seconds, self.elapsed = defaultdict(float, progress["seconds"]), progress["elapsed"]
@@ -603,16 +570,11 @@ def _check_trainable(model: HybridModel) -> None:
         )
 
 
-def _can_capture(model: HybridModel) -> bool:
-    """Return whether kernels compute a whole step. What replaces them may wait for the GPU or upload numbers."""
-    return replaced_operations().isdisjoint(GPU_OPERATIONS) and not model.config.position_gradients
-
-
-def _on_cpu(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def _copy_to_cpu(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: value.detach().cpu() for name, value in tensors.items()}
 
 
-def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+def _select_prefixed(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors whose names start with `prefix`, by the names without it."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 

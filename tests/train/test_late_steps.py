@@ -86,13 +86,13 @@ def use_reserves(trainer: Trainer, reserve_of: Callable[[int], Reserve]) -> list
         sizes.append(gaussians)
         return reserve_of(len(sizes) - 1)
 
-    trainer._reserves.estimate_shared = estimate  # type: ignore[method-assign]
+    trainer.renderer.reserves.estimate_shared = estimate  # type: ignore[method-assign]
     return sizes
 
 
 def state_of(trainer: Trainer) -> dict[str, Tensor]:
     """Return all that a later step depends on, on the CPU."""
-    tensors = trainer._tensors() | {
+    tensors = trainer._collect_tensors() | {
         f"density.{name}": value.cpu() for name, value in trainer.strategy.state_dict().items()
     }
     return {name: value.clone() for name, value in tensors.items()}

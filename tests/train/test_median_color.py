@@ -100,4 +100,4 @@ def test_an_object_before_a_black_or_white_wall_is_learnt(level):
 def test_transparent_photos_have_the_same_background_in_training_and_in_scores():
     scene = ball_scene(points=30, alpha=True)
     trainer = Trainer(scene, TrainConfig(steps=1, background=True, background_color="white"))
-    np.testing.assert_array_equal(trainer._solid(1), [1, 1, 1])
+    np.testing.assert_array_equal(trainer._choose_background_color(1), [1, 1, 1])

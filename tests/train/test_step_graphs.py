@@ -109,10 +109,10 @@ def final_state(scene: Scene, config: TrainConfig, device: torch.device, *, grap
     """Return the state after a run, and what was reported of its steps."""
     trainer, reports = Trainer(scene, config, device=device), []
     if not graphs:
-        trainer.replays_steps = False
+        trainer.renderer.replays_steps = False
     trainer.run(progress=lambda event: reports.append((event.loss, event.mse, event.gaussians)))
     observed = {f"density.{name}": value.cpu() for name, value in trainer.strategy.state_dict().items()}
-    return trainer._tensors() | observed | {"reports": torch.tensor(reports)}
+    return trainer._collect_tensors() | observed | {"reports": torch.tensor(reports)}
 
 
 @pytest.mark.acceptance

@@ -282,10 +282,10 @@ def test_a_parameter_that_is_not_finite_stops_the_run_and_is_named(name):
 def test_a_view_that_cannot_be_rendered_is_named_with_the_reason_and_its_fix(monkeypatch):
     trainer = Trainer(make_scene(), SHORT_CONFIG)
 
-    def fail(*_):
+    def fail(*_, **__):
         raise HyrfError("the view's pose: a number is infinite", fix="correct the pose")
 
-    monkeypatch.setattr(trainer, "_compute", fail)
+    monkeypatch.setattr(trainer.renderer, "compute_gradients", fail)
     first = next(trainer._order()).name
     with pytest.raises(HyrfTrainingError) as caught:
         trainer.run()

@@ -90,12 +90,12 @@ def time_training(room: str, scene: Scene, model: HybridModel, setup: Setup) -> 
     peak = read_peak_memory_mb(device)
     stages = {name: value - stages.get(name, 0.0) for name, value in trainer.seconds.items()}
     launched_rate = None
-    if trainer.replays_steps:
-        trainer.replays_steps = False
+    if trainer.renderer.replays_steps:
+        trainer.renderer.replays_steps = False
         advance(trainer, WARM_LAUNCHED_STEPS, setup.step_seconds / 3, [])
         launched, launched_seconds = _time_steps(trainer, LAUNCHED_STEPS, setup.step_seconds / 3, [])
         launched_rate = launched / launched_seconds
-        trainer.replays_steps = True
+        trainer.renderer.replays_steps = True
     profile = profile_task(lambda: advance(trainer, PROFILED_STEPS, setup.step_seconds, []), 1, device)
     return TimedTraining(
         room=room,
