@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hyrfpack.imports import ImportConfig
-from hyrfpack.splats.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalize_quats
 
 TINY_IMPORT_CONFIG = ImportConfig(size=24, views=6, test_views=2)
 
@@ -17,7 +17,7 @@ def ball_splats(count: int, degree: int = 1, seed: int = 0) -> Splats:
     return Splats(
         positions / np.linalg.norm(positions, axis=1, keepdims=True),
         rng.uniform(0.03, 0.2, (count, 3)),
-        normalized_quats(rng.normal(size=(count, 4))),
+        normalize_quats(rng.normal(size=(count, 4))),
         rng.uniform(0.3, 0.95, count),
         0.4 * rng.normal(size=(count, (degree + 1) ** 2, 3)),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from hyrfpack.splats.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalize_quats
 
 # Each edit is a position, as a fraction of the file, and the bytes that replace the byte there.
 FILE_EDITS = st.lists(st.tuples(st.floats(0, 0.999), st.binary(min_size=0, max_size=3)), min_size=1, max_size=4)
@@ -19,7 +19,7 @@ def random_splats(count: int = 40, degree: int = 3, shift=(0.0, 0.0, 0.0)) -> Sp
     return Splats(
         rng.normal(size=(count, 3)) + shift,
         np.exp(rng.normal(size=(count, 3)) - 3),
-        normalized_quats(rng.normal(size=(count, 4))),
+        normalize_quats(rng.normal(size=(count, 4))),
         rng.random(count),
         rng.normal(size=(count, (degree + 1) ** 2, 3)) * 0.3,
     )

@@ -9,8 +9,8 @@ from photo_sets import READ_PATHS_BY_SET, write_photo_sets
 
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfError
-from hyrfpack.export.folder import check_folder
-from hyrfpack.export.kinds import EXPORT_ENDINGS, check_place
+from hyrfpack.export.folder import check_export_folder
+from hyrfpack.export.kinds import EXPORT_ENDINGS, check_export_target
 from hyrfpack.make.source import LoadSettings, Source
 from hyrfpack.outputs import Outputs
 from hyrfpack.poses import estimate_poses
@@ -54,7 +54,7 @@ def test_nothing_new_is_written_beside_what_a_scene_is_read_from(name, folder, o
             outputs.file(f"{folder}/new{ending}")
     for ending in EXPORT_ENDINGS:
         with pytest.raises(HyrfError):
-            check_place(f"{folder}/new{ending}", outputs)
+            check_export_target(f"{folder}/new{ending}", outputs)
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -81,8 +81,8 @@ def test_an_existing_export_is_replaced_only_with_overwrite(ending, tmp_path):
     (tmp_path / f"a{ending}").write_bytes(b"of another program")
 
     with pytest.raises(HyrfError, match="there is a file of this name"):
-        check_place(tmp_path / f"a{ending}", Outputs("model.hyrf"))
-    check_place(tmp_path / f"a{ending}", Outputs("model.hyrf", overwrite=True))
+        check_export_target(tmp_path / f"a{ending}", Outputs("model.hyrf"))
+    check_export_target(tmp_path / f"a{ending}", Outputs("model.hyrf", overwrite=True))
 
 
 @pytest.mark.parametrize("name", READ_PATHS_BY_SET)
@@ -99,7 +99,7 @@ def test_a_set_that_is_not_read_is_written_to_only_with_overwrite(name):
 @pytest.mark.parametrize(("name", "folder"), PROTECTED_FOLDERS)
 def test_a_player_is_not_written_among_photos_and_poses(name, folder, is_gallery):
     def check(scene: Scene | None, overwrite: bool) -> None:
-        check_folder(folder, [], [scene], overwrite=overwrite, is_gallery=is_gallery)
+        check_export_folder(folder, [], [scene], overwrite=overwrite, is_gallery=is_gallery)
 
     for overwrite in (False, True):
         with pytest.raises(HyrfError, match="reads what lies in this folder"):

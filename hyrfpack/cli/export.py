@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,7 @@ from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
     from hyrfpack.export import ExportReport
+    from hyrfpack.scene import Scene
     from hyrfpack.splats.table import FileKind
 
 
@@ -113,15 +115,42 @@ def export(
       hyrfpack export bonsai-scene -o streamed/ --streamed-sog
       hyrfpack export bonsai-scene -o tiles/ --3d-tiles
     """
-    from hyrfpack.export import export_model as write
-    from hyrfpack.export.folder import check_folder, export_gallery, export_player
-    from hyrfpack.export.kinds import PLAYER_FOLDER, check_place, check_request, find_file_kind
-    from hyrfpack.format import describe_file, find_model
+    from hyrfpack.export.folder import check_export_folder
+    from hyrfpack.export.kinds import PLAYER_FOLDER, check_export_target, check_request, find_file_kind
+    from hyrfpack.format import describe_file
     from hyrfpack.format.input_folder import find_input_folder
-    from hyrfpack.splats.names import is_splats
 
     config = ExportConfig(**settings)
     kind = find_file_kind(output, config)
+    files = _find_model_files(models, data, output, kind)
+    check_request(kind, output, config)
+    scenes = [
+        read_scene(path, reader_options, describe_file(model), must_match=True)
+        for path, model in zip(data, files, strict=False)
+    ]
+    if kind is PLAYER_FOLDER:
+        check_export_folder(output, models, scenes, overwrite=overwrite, is_gallery=len(models) > 1)
+    else:
+        folder, scene = find_input_folder(files[0]), scenes[0] if scenes else None
+        check_export_target(output, Outputs(*files, folder=folder, scene=scene, overwrite=overwrite), config)
+    report = _write_export(models, scenes, output, config, overwrite=overwrite)
+    note_rename(output, report.file)
+    if as_json:
+        print_json(asdict(report))
+        return
+    _print_report(report)
+
+
+def _find_model_files(models: Sequence[Path], data: Sequence[Path], output: Path, kind: FileKind) -> list[Path]:
+    """Return the file of each MODEL: that of a run, and splats as they are.
+
+    Raises:
+        HyrfError: the output takes another number of models, no splats, or the models other photos.
+    """
+    from hyrfpack.export.kinds import PLAYER_FOLDER
+    from hyrfpack.format import find_model
+    from hyrfpack.splats.names import is_splats
+
     if len(models) != 1 and kind is not PLAYER_FOLDER:
         what = "there is no MODEL to write" if not models else "several models make a gallery, which is a folder"
         raise HyrfError(f"{output}: {what}", fix="name one MODEL")
@@ -136,37 +165,21 @@ def export(
             f"--data is given {format_count(len(data), 'time')} for {format_count(len(models), 'model')}",
             fix="give it once for each model, or not at all",
         )
-    check_request(kind, output, config)
-    scenes = [
-        read_scene(path, reader_options, describe_file(model), must_match=True)
-        for path, model in zip(data, files, strict=False)
-    ]
-    if kind is PLAYER_FOLDER:
-        check_folder(output, models, scenes, overwrite=overwrite, is_gallery=len(models) > 1)
-    else:
-        folder, scene = find_input_folder(files[0]), scenes[0] if scenes else None
-        check_place(output, Outputs(*files, folder=folder, scene=scene, overwrite=overwrite), config)
+    return files
+
+
+def _write_export(
+    models: Sequence[Path], scenes: Sequence[Scene], output: Path, config: ExportConfig, *, overwrite: bool
+) -> ExportReport:
+    """Write a gallery of several models, a player without any, or the export of one."""
+    from hyrfpack.export import export_gallery, export_model, export_player
+
+    texts: dict[str, Any] = {"title": config.title, "credit": config.credit, "editable": config.editable}
     if len(models) > 1:
-        report = export_gallery(
-            models,
-            output,
-            data=scenes,
-            overwrite=overwrite,
-            title=config.title,
-            credit=config.credit,
-            editable=config.editable,
-        )
-    elif not models:
-        report = export_player(
-            None, output, overwrite=overwrite, title=config.title, credit=config.credit, editable=config.editable
-        )
-    else:
-        report = write(models[0], output, config, data=scenes[0] if scenes else None, overwrite=overwrite)
-    note_rename(output, report.file)
-    if as_json:
-        print_json(asdict(report))
-        return
-    _print_report(report)
+        return export_gallery(models, output, data=scenes, overwrite=overwrite, **texts)
+    if not models:
+        return export_player(None, output, overwrite=overwrite, **texts)
+    return export_model(models[0], output, config, data=scenes[0] if scenes else None, overwrite=overwrite)
 
 
 def _splats_error(source: Path, output: Path, kind: FileKind) -> HyrfError:
@@ -198,6 +211,7 @@ def _print_exposures(report: ExportReport) -> None:
 
 
 def _print_report(report: ExportReport) -> None:
+    """Print the scores of an export, what was written, and the size of it."""
     if report.native:
         click.echo(
             f"{report.file}: {report.bytes:,} bytes, {format_count(report.gaussians, 'Gaussian')}, unchanged: "
@@ -205,11 +219,11 @@ def _print_report(report: ExportReport) -> None:
         )
         return
     ending = Path(report.file).suffix
-    written, rounding = ("folder, finest level", "the format") if report.chunks else (f"{ending} file", ending)
+    written_kind, rounding = ("folder, finest level", "the format") if report.chunks else (f"{ending} file", ending)
     if report.views:
         rows = [
             [f"baked to harmonics of degree {report.degree}, before writing", f"{report.psnr_baked:.2f}"],
-            [f"read back from the {written}", f"{report.psnr:.2f}"],
+            [f"read back from the {written_kind}", f"{report.psnr:.2f}"],
         ]
         click.echo(
             format_table([f"against renders of the model, {format_count(report.views, 'view')}", "PSNR (dB)"], rows)
@@ -225,18 +239,21 @@ def _print_report(report: ExportReport) -> None:
             )
     if report.psnr_by_exposure:
         _print_exposures(report)
-    behind = f", {report.background:,} of them for the background" if report.background else ""
-    holds = f", {format_count(report.gaussians, 'Gaussian')}{behind}" if report.gaussians else ""
+    background_text = f", {report.background:,} of them for the background" if report.background else ""
+    gaussians_text = f", {format_count(report.gaussians, 'Gaussian')}{background_text}" if report.gaussians else ""
     cameras = f", {format_count(report.cameras, 'camera')}" if report.cameras else ""
     mesh = f", {report.vertices:,} vertices, {format_count(report.faces, 'triangle')}" if report.faces else ""
     voxels = f", voxels of {report.voxel:.4g} units" if report.voxel else ""
-    click.echo(f"{report.file}: {report.bytes:,} bytes{holds}{cameras}{mesh}{voxels}")
+    click.echo(f"{report.file}: {report.bytes:,} bytes{gaussians_text}{cameras}{mesh}{voxels}")
     if report.chunks:
         levels = ", ".join(f"{count:,}" for count in report.level_gaussians)
         click.echo(f"{format_count(report.chunks, 'chunk')}; Gaussians at each level, without the background: {levels}")
     if report.surface_to_mesh and report.mesh_to_surface and report.wall:
-        ways = {"surface to mesh": report.surface_to_mesh, "mesh to surface": report.mesh_to_surface}
-        rows = [[way, *(f"{distance:.4g}" for distance in distances)] for way, distances in ways.items()]
+        distances_by_direction = {"surface to mesh": report.surface_to_mesh, "mesh to surface": report.mesh_to_surface}
+        rows = [
+            [direction, *(f"{distance:.4g}" for distance in distances)]
+            for direction, distances in distances_by_direction.items()
+        ]
         click.echo(format_table(["distance, units", "mean", "95 %"], rows))
         click.echo(f"the mesh is closed; behind the surface it has walls of {report.wall:.4g} units")
     if report.photos_model is not None:

@@ -19,8 +19,8 @@ from hyrfpack.lod import LevelRenderer
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel
 from hyrfpack.splats.draw import Drawable
-from hyrfpack.splats.files import read_splats
-from hyrfpack.splats.names import is_splats, sog_folder
+from hyrfpack.splats.files import bytes_on_disk, read_splats
+from hyrfpack.splats.names import find_sog_folder, is_splats
 from hyrfpack.splats.viewpoints import WeightedSplats
 
 
@@ -103,13 +103,11 @@ class RenderSource:
         """The folder whose files are all read; None if a single file is read."""
         if self.scene is not None and self.scene.path.is_dir():
             return self.scene.path
-        return sog_folder(self.path) if self.splats is not None else None
+        return find_sog_folder(self.path) if self.splats is not None else None
 
     @property
     def bytes(self) -> int:
         """Size on disk in bytes."""
         if self.scene is not None:
             return self.scene.manifest.total_bytes
-        from hyrfpack.splats.files import bytes_on_disk
-
         return bytes_on_disk(self.path)

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.export.bake import TRANSMITTANCE_STRIDE_PIXELS, CameraVisibility, check_finite, compute_visibility
-from hyrfpack.export.exposure import camera_log_gains, typical_log_gains
+from hyrfpack.export.exposure import average_log_gains, predict_camera_log_gains
 from hyrfpack.model import BACKGROUND_RADIUS, Frame, HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.ops.background import pixel_directions, sphere_points
@@ -57,7 +57,7 @@ GAIN_BATCH_DIRECTIONS = 1 << 14
 
 @torch_on_one_thread()
 @torch.no_grad()
-def background_splats(
+def make_background_splats(
     model: HybridModel,
     cameras: Sequence[Camera],
     largest_scale: float = math.inf,
@@ -113,7 +113,7 @@ def background_splats(
     )
 
 
-def background_reach(frame: Frame) -> float:
+def compute_background_reach(frame: Frame) -> float:
     """Return the largest absolute coordinate that background splats can have, world units."""
     farthest = BACKGROUND_RADIUS * RADIUS_RATIO_PER_LEVEL ** (MAX_CELL_LEVEL - MIN_CELL_LEVEL)
     return float(np.abs(frame.center).max()) + farthest * frame.scale
@@ -121,7 +121,7 @@ def background_reach(frame: Frame) -> float:
 
 @torch_on_one_thread()
 @torch.no_grad()
-def background_picture(
+def render_background_picture(
     model: HybridModel,
     height: int | None = None,
     cameras: Sequence[Camera] = (),
@@ -163,7 +163,7 @@ def background_picture(
     level = latitudes.cos()
     directions = torch.stack((level * longitudes.sin(), -latitudes.sin(), level * longitudes.cos()), -1)
     flat_directions = (directions.reshape(-1, 3) @ torch.from_numpy(model.config.frame.axes)).float()  # local axes
-    colors = _sphere_colors(model, flat_directions)
+    colors = _evaluate_sphere_colors(model, flat_directions)
     gains = BackgroundGains.predict(model, cameras, visibility)
     if gains is not None:
         colors = torch.cat(
@@ -204,22 +204,22 @@ class BackgroundGains:
         Args:
             model: a model on the CPU.
             cameras: cameras from which the model was photographed, world units. Without any, or if none sees light of
-                the sphere, the gains are the same in all directions; see `typical_log_gains`.
+                the sphere, the gains are the same in all directions; see `average_log_gains`.
             visibility: result of `compute_visibility` for the cameras, if it is known already.
         """
         if model.exposure is None:
             return None
-        logs = camera_log_gains(model, model.exposure, cameras)
-        centers = cell_centers(np.arange(6 * 4**MIN_CELL_LEVEL), MIN_CELL_LEVEL)[0]
+        logs = predict_camera_log_gains(model, model.exposure, cameras)
+        centers = compute_cell_centers(np.arange(6 * 4**MIN_CELL_LEVEL), MIN_CELL_LEVEL)[0]
         light, sums = np.zeros(len(centers)), np.zeros((len(centers), 3))
         visibility = compute_visibility(model, cameras) if visibility is None else visibility
         for log, pixels in zip(logs, _iterate_seen_pixels(model, cameras, visibility), strict=True):
-            cells = find_cells(pixels.places.double().numpy(), MIN_CELL_LEVEL)
+            cells = find_cells(pixels.surface_points.double().numpy(), MIN_CELL_LEVEL)
             received = np.bincount(cells, pixels.weights, len(centers))
             light += received
             sums += received[:, None] * log
         if not light.any():
-            light, sums = np.ones(len(centers)), np.tile(typical_log_gains(model.exposure, logs), (len(centers), 1))
+            light, sums = np.ones(len(centers)), np.tile(average_log_gains(model.exposure, logs), (len(centers), 1))
         is_seen = light > 0
         centers, light, means = centers[is_seen], light[is_seen], sums[is_seen] / light[is_seen, None]
         return cls(*(torch.from_numpy(array).float() for array in (centers, np.log(light), means)))
@@ -231,7 +231,7 @@ class BackgroundGains:
         return (weights @ self.log_gains).exp()
 
 
-def _sphere_colors(model: HybridModel, directions: Tensor) -> Tensor:
+def _evaluate_sphere_colors(model: HybridModel, directions: Tensor) -> Tensor:
     """Evaluate the colours (N, 3) of the sphere along unit vectors (N, 3) from its centre, in local axes."""
     encoding = model.config.direction_encoding
     colors = torch.cat(
@@ -249,14 +249,14 @@ class _SeenPixels(NamedTuple):
 
     Attributes:
         viewport: the camera of `shrink_camera`, in local units.
-        points: (n, 2) pixel coordinates in its picture.
-        places: (n, 3) points of the sphere that these pixels show, local units.
+        pixel_points: (n, 2) pixel coordinates in its picture.
+        surface_points: (n, 3) points of the sphere that these pixels show, local units.
         weights: (n,) float64 squared transmittances.
     """
 
     viewport: Viewport
-    points: Tensor
-    places: Tensor
+    pixel_points: Tensor
+    surface_points: Tensor
     weights: np.ndarray
 
 
@@ -269,10 +269,13 @@ def _iterate_seen_pixels(
         check_finite("Gaussians", camera_visibility.transmittance)
         rows, columns = torch.nonzero(camera_visibility.transmittance > threshold).unbind(1)
         viewport = model.config.frame.local_viewport(camera)
-        points = torch.stack((columns, rows), -1) * TRANSMITTANCE_STRIDE_PIXELS + 0.5
-        places = sphere_points(camera_center(viewport.pose), pixel_directions(points, viewport))
+        pixel_points = torch.stack((columns, rows), -1) * TRANSMITTANCE_STRIDE_PIXELS + 0.5
+        surface_points = sphere_points(camera_center(viewport.pose), pixel_directions(pixel_points, viewport))
         yield _SeenPixels(
-            viewport, points, places, camera_visibility.transmittance[rows, columns].double().square().numpy()
+            viewport,
+            pixel_points,
+            surface_points,
+            camera_visibility.transmittance[rows, columns].double().square().numpy(),
         )
 
 
@@ -296,14 +299,16 @@ def _accumulate_colors(
         columns = np.column_stack((np.ones(len(values)), values, (values**2).sum(1)))
         sums[cells] += np.column_stack([np.bincount(rows, weights * column, len(cells)) for column in columns.T])
 
-    net = torch.from_numpy(cell_centers(np.arange(6 * 4 ** (MIN_CELL_LEVEL + 2)), MIN_CELL_LEVEL + 2)[0]).float()
-    add(net, _sphere_colors(model, net), np.full(len(net), UNSEEN_COLOR_WEIGHT))
+    even_level = MIN_CELL_LEVEL + 2
+    even_directions = torch.from_numpy(compute_cell_centers(np.arange(6 * 4**even_level), even_level)[0]).float()
+    even_colors = _evaluate_sphere_colors(model, even_directions)
+    add(even_directions, even_colors, np.full(len(even_directions), UNSEEN_COLOR_WEIGHT))
     largest = math.inf
     for camera, seen in zip(map(shrink_camera, cameras), _iterate_seen_pixels(model, cameras, visibility), strict=True):
-        if len(seen.points):
-            colors = model.decode_background(seen.points, seen.viewport)
+        if len(seen.pixel_points):
+            colors = model.decode_background(seen.pixel_points, seen.viewport)
             check_finite("background", colors)
-            add(seen.places, colors, seen.weights)
+            add(seen.surface_points, colors, seen.weights)
             narrow = math.atan(min(camera.width / camera.fx, camera.height / camera.fy) / 2)
             largest = min(largest, MAX_LIT_CELL_VIEW_RATIO * narrow)
     return sums, largest
@@ -339,15 +344,17 @@ def _divide_sphere(
     is_divided[order] = True
     divided = [*np.split(is_divided, np.cumsum([len(level) for level in errors])[:-1]), np.zeros(len(sums), bool)]
 
-    found = []
-    index, above = np.arange(len(pyramid[0])), np.full((len(pyramid[0]), 3), 0.5)
+    cells_by_level = []
+    index, parent_colors = np.arange(len(pyramid[0])), np.full((len(pyramid[0]), 3), 0.5)
     for level, (cells, is_parent) in enumerate(zip(pyramid, divided, strict=True), MIN_CELL_LEVEL):
         weights = cells[index, :1]
-        colors = np.where(weights > 0, cells[index, 1:4] / np.where(weights > 0, weights, 1), above)
-        kept, parts = ~is_parent[index], is_parent[index]
-        found.append((*cell_centers(index[kept], level), np.full(kept.sum(), level), colors[kept]))
-        index, above = (4 * index[parts][:, None] + np.arange(4)).ravel(), colors[parts].repeat(4, axis=0)
-    directions, sides, levels, colors = (np.concatenate(columns) for columns in zip(*found, strict=True))
+        colors = np.where(weights > 0, cells[index, 1:4] / np.where(weights > 0, weights, 1), parent_colors)
+        is_leaf, is_split = ~is_parent[index], is_parent[index]
+        cells_by_level.append(
+            (*compute_cell_centers(index[is_leaf], level), np.full(is_leaf.sum(), level), colors[is_leaf])
+        )
+        index, parent_colors = (4 * index[is_split][:, None] + np.arange(4)).ravel(), colors[is_split].repeat(4, axis=0)
+    directions, sides, levels, colors = (np.concatenate(columns) for columns in zip(*cells_by_level, strict=True))
     return directions, sides, levels, colors
 
 
@@ -369,7 +376,7 @@ def find_cells(points: np.ndarray, level: int) -> np.ndarray:
     return cells
 
 
-def cell_centers(cells: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
+def compute_cell_centers(cells: np.ndarray, level: int) -> tuple[np.ndarray, np.ndarray]:
     """Return unit vectors (N, 3) to the centres of cells (N,) of a level >= 1, and sides (N,) of the cells.
 
     The side of a cell is the square root of its solid angle, in radians.

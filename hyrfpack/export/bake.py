@@ -29,7 +29,7 @@ from hyrfpack.progress import Progress, count_calls, ignore_progress
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import Camera
 from hyrfpack.splats.harmonics import fibonacci_sphere
-from hyrfpack.splats.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalize_quats
 
 SPHERE_DIRECTIONS = 32
 SPHERE_WEIGHT = 3e-3  # total weight of all SPHERE_DIRECTIONS, where all cameras together weigh 1
@@ -100,7 +100,7 @@ def bake(
     shared = (
         positions.double().numpy() * frame.scale,
         scales.numpy(),
-        normalized_quats(geometry.quats.numpy()),
+        normalize_quats(geometry.quats.numpy()),
         opacities.numpy(),
     )
     fitted = _fit_harmonics(model, visibility, light, BakeGains.predict(model, cameras, visibility), degrees, progress)
@@ -117,7 +117,7 @@ def bake(
 
 
 @torch.no_grad()
-def kept_mask(model: HybridModel, visibility: Sequence[CameraVisibility]) -> np.ndarray:
+def keep_mask(model: HybridModel, visibility: Sequence[CameraVisibility]) -> np.ndarray:
     """Return a mask (N,) of the Gaussians that `bake` keeps, given the result of `compute_visibility`."""
     return _correct_opacities(model.decode_geometry().opacities, *_sum_light(len(model), visibility))[1]
 
@@ -242,7 +242,10 @@ def _fit_harmonics(
         block_slice = slice(start, stop)
         mean_gains = None if gains is None else gains.gaussians[block_slice]
         sphere_colors = torch.stack(
-            [_centered_colors(direction[None], shading, residuals, block_slice, mean_gains) for direction in sphere]
+            [
+                _evaluate_centered_colors(direction[None], shading, residuals, block_slice, mean_gains)
+                for direction in sphere
+            ]
         ).flatten(1)
         right_sides = (weighted_sphere_basis @ sphere_colors).reshape(terms, stop - start, 3).transpose(0, 1)
         rows = [
@@ -258,7 +261,7 @@ def _fit_harmonics(
             index = view.index[view_slice].long()
             directions = torch.nn.functional.normalize(positions[index] - view.viewpoint, dim=-1, eps=1e-12)
             camera_gains = None if gains is None else gains.cameras[number]
-            colors = _centered_colors(directions, shading, residuals, index, camera_gains)
+            colors = _evaluate_centered_colors(directions, shading, residuals, index, camera_gains)
             weights = (view.light[view_slice] / light[index]).float()
             rows.append((index - start, harmonics_basis(directions, highest), colors, weights))
         owners, basis, colors, weights = map(torch.cat, zip(*rows, strict=True))
@@ -278,7 +281,7 @@ def _fit_harmonics(
     return fitted
 
 
-def _centered_colors(
+def _evaluate_centered_colors(
     directions: Tensor, shading: Shading, residuals: Tensor | None, index: Tensor | slice, gains: Tensor | None
 ) -> Tensor:
     """Evaluate colours minus 0.5 (n, 3) of Gaussians along directions, exposed by `gains` (3,) or (n, 3) if given.

@@ -52,7 +52,7 @@ def bake_parts(
     """
     parts, baked = parts_of(model), []
     for number, part in enumerate(parts):
-        known = None if visibility is None else visibility[number]
+        part_visibility = None if visibility is None else visibility[number]
         share = part_of_progress(progress, number / len(parts), (number + 1) / len(parts))
-        baked.append(bake(part, cameras, degrees, known, share))
+        baked.append(bake(part, cameras, degrees, part_visibility, share))
     return {degree: concatenate([splats[degree] for splats in baked]) for degree in degrees}

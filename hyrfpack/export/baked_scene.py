@@ -11,11 +11,11 @@ import numpy as np
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE, LOCAL_EXPOSURE, SPLAT_EXPOSURES
 from hyrfpack.config.export import ExportConfig
-from hyrfpack.export.background import background_picture, background_splats
-from hyrfpack.export.bake import kept_mask
+from hyrfpack.export.background import make_background_splats, render_background_picture
+from hyrfpack.export.bake import keep_mask
 from hyrfpack.export.bake_parts import PartsVisibility, bake_parts, compute_parts_visibility
 from hyrfpack.export.degree import choose_degree
-from hyrfpack.export.kinds import HTML_PAGE, POSITION_KINDS, includes_background, selection_mask
+from hyrfpack.export.kinds import HTML_PAGE, POSITION_KINDS, includes_background, make_selection_mask
 from hyrfpack.export.source import Source
 from hyrfpack.model import BACKGROUND_RADIUS, Frame, HybridModel
 from hyrfpack.model.merged import map_parts, parts_of, scene_of
@@ -29,7 +29,7 @@ _LOG = logging.getLogger(__name__)
 MIN_BACKGROUND_RADIUS = 6
 
 # Splats, with the picture of their background or None.
-ShownSplats = tuple[Splats, np.ndarray | None]
+SplatsWithBackground = tuple[Splats, np.ndarray | None]
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class BakedScene:
     degree: int
     chosen_by: dict[int, float] = field(default_factory=dict)
     exposure: str | None = None
-    by_exposure: dict[str, ShownSplats] = field(default_factory=dict)
+    by_exposure: dict[str, SplatsWithBackground] = field(default_factory=dict)
 
 
 def bake_scene(source: Source, kind: FileKind, config: ExportConfig, progress: Progress) -> BakedScene:
@@ -73,27 +73,30 @@ def bake_scene(source: Source, kind: FileKind, config: ExportConfig, progress: P
     Raises:
         HyrfError: the settings leave no Gaussian.
     """
-    by_exposure = {LOCAL_EXPOSURE: source, CONSISTENT_EXPOSURE: _without_exposure_map(source)}
+    by_exposure = {LOCAL_EXPOSURE: source, CONSISTENT_EXPOSURE: _remove_exposure_map(source)}
     loaded = by_exposure[config.exposure]
     degree, chosen_by, visibility = _decide_degree(loaded, kind, config, part_of_progress(progress, 0.0, 0.7))
     fit_progress = part_of_progress(progress, 0.7 if chosen_by else 0.5, 0.8)
     baked = _bake_at(loaded, kind, config, degree, visibility, fit_progress)
-    has_map = any(part.exposure is not None for part in parts_of(source.drawn))
+    has_map = any(part.exposure is not None for part in parts_of(source.all_parts))
     baked = replace(baked, chosen_by=chosen_by, exposure=config.exposure if has_map else None)
     if not has_map or config.crop is not None or not source.measured_views or kind in POSITION_KINDS:
         return baked
-    (other,) = set(SPLAT_EXPOSURES) - {config.exposure}
-    _LOG.info(f"fitting colours of {other} exposure for comparison")
-    rival = _bake_at(by_exposure[other], kind, config, degree, visibility, part_of_progress(progress, 0.8, 1.0))
-    shown = {config.exposure: (baked.splats, baked.picture), other: (rival.splats, rival.picture)}
-    return replace(baked, by_exposure=shown)
+    (other_exposure,) = set(SPLAT_EXPOSURES) - {config.exposure}
+    _LOG.info(f"fitting colours of {other_exposure} exposure for comparison")
+    other_progress = part_of_progress(progress, 0.8, 1.0)
+    other_baked = _bake_at(by_exposure[other_exposure], kind, config, degree, visibility, other_progress)
+    baked_by_exposure = {config.exposure: baked, other_exposure: other_baked}
+    return replace(
+        baked, by_exposure={exposure: (each.splats, each.picture) for exposure, each in baked_by_exposure.items()}
+    )
 
 
 def _decide_degree(
     loaded: Source, kind: FileKind, config: ExportConfig, progress: Progress
 ) -> tuple[int, dict[int, float], PartsVisibility]:
     """Return the degree of the harmonics, the scores if it was chosen by these, and what the cameras see."""
-    places = f"{len(loaded.fit_cameras)} " + (
+    camera_text = f"{len(loaded.fit_cameras)} " + (
         "cameras"
         if loaded.cameras
         else "viewpoints around the scene, because the file stores no cameras (name photos with `data`)"
@@ -104,16 +107,20 @@ def _decide_degree(
     degree, chosen_by = highest, dict[int, float]()
     is_chosen = config.degree is None and highest > 0
     if is_chosen:
-        _LOG.info(f"choosing the degree of the spherical harmonics at {places}")
-        visibility = compute_parts_visibility(loaded.drawn, loaded.fit_cameras, part_of_progress(progress, 0.0, 0.43))
+        _LOG.info(f"choosing the degree of the spherical harmonics at {camera_text}")
+        visibility = compute_parts_visibility(
+            loaded.all_parts, loaded.fit_cameras, part_of_progress(progress, 0.0, 0.43)
+        )
         degree, chosen_by = choose_degree(
-            loaded.drawn, loaded.fit_cameras, highest, visibility, part_of_progress(progress, 0.43, 1.0)
+            loaded.all_parts, loaded.fit_cameras, highest, visibility, part_of_progress(progress, 0.43, 1.0)
         )
         scores = ", ".join(f"{score:.2f}" for score in chosen_by.values())
         _LOG.info(f"chosen degree {degree}: {scores} dB against the model for degrees 0 to {highest}")
-    _LOG.info(f"fitting colours of degree {degree} at {places}")
+    _LOG.info(f"fitting colours of degree {degree} at {camera_text}")
     if not is_chosen:
-        visibility = compute_parts_visibility(loaded.drawn, loaded.fit_cameras, part_of_progress(progress, 0.0, 0.71))
+        visibility = compute_parts_visibility(
+            loaded.all_parts, loaded.fit_cameras, part_of_progress(progress, 0.0, 0.71)
+        )
     return degree, chosen_by, visibility
 
 
@@ -126,16 +133,16 @@ def _bake_at(
     progress: Progress,
 ) -> BakedScene:
     """Bake a model at a degree, select splats, and add the background."""
-    splats = bake_parts(loaded.drawn, loaded.fit_cameras, (degree,), visibility, progress)[degree]
+    splats = bake_parts(loaded.all_parts, loaded.fit_cameras, (degree,), visibility, progress)[degree]
     sphere = includes_background(loaded, kind, config)
-    kept = [kept_mask(part, views) for part, views in zip(parts_of(loaded.drawn), visibility, strict=True)]
-    selected = selection_mask(splats.positions, splats.opacities, config.crop, config.min_opacity)
-    index = np.flatnonzero(np.concatenate(kept))[selected]
+    keep_masks = [keep_mask(part, views) for part, views in zip(parts_of(loaded.all_parts), visibility, strict=True)]
+    selected = make_selection_mask(splats.positions, splats.opacities, config.crop, config.min_opacity)
+    index = np.flatnonzero(np.concatenate(keep_masks))[selected]
     splats, picture, background_count = splats if selected.all() else splats[selected], None, 0
     if sphere and kind is HTML_PAGE:
-        picture = background_picture(loaded.model, cameras=loaded.fit_cameras, visibility=visibility[0])
+        picture = render_background_picture(loaded.model, cameras=loaded.fit_cameras, visibility=visibility[0])
     elif sphere:
-        distant = background_splats(loaded.model, loaded.fit_cameras, kind.max_scale, visibility[0])
+        distant = make_background_splats(loaded.model, loaded.fit_cameras, kind.max_scale, visibility[0])
         _warn_of_near_background(loaded.model.config.frame, distant, kind)
         splats, background_count = concatenate((splats, distant)), len(distant)
     return BakedScene(loaded, splats, index, background_count, picture, sphere, degree)
@@ -152,7 +159,7 @@ def _warn_of_near_background(frame: Frame, distant: Splats, kind: FileKind) -> N
         )
 
 
-def _without_exposure_map(loaded: Source) -> Source:
+def _remove_exposure_map(loaded: Source) -> Source:
     """Return a copy without the exposure map, for renders and bakes of consistent exposure; parameters are shared."""
 
     def without_map(part: HybridModel) -> HybridModel:
@@ -160,5 +167,5 @@ def _without_exposure_map(loaded: Source) -> Source:
         changed.exposure = None
         return changed
 
-    drawn = map_parts(without_map, loaded.drawn)
-    return replace(loaded, model=scene_of(drawn), drawn=drawn)
+    all_parts = map_parts(without_map, loaded.all_parts)
+    return replace(loaded, model=scene_of(all_parts), all_parts=all_parts)

@@ -87,7 +87,7 @@ class BoxTree:
             return cls(box, numbers[0])
         centers = np.stack([boxes[number].center for number in numbers])
         axis = int(np.ptp(centers, axis=0).argmax())
-        ordered = [numbers[place] for place in np.argsort(centers[:, axis], kind="stable").tolist()]
+        ordered = [numbers[position] for position in np.argsort(centers[:, axis], kind="stable").tolist()]
         half = len(ordered) // 2
         return cls(box, None, (cls.build(boxes, ordered[:half]), cls.build(boxes, ordered[half:])))
 

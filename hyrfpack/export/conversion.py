@@ -24,13 +24,13 @@ from hyrfpack.export.kinds import (
     find_kind_by_ending,
     select_splats,
 )
-from hyrfpack.export.measure import psnr_of_splats
+from hyrfpack.export.measure import measure_splats_psnr
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.files import READABLE_ENDINGS, bytes_on_disk, read_splats
 from hyrfpack.splats.formats.hints import Hints
-from hyrfpack.splats.names import is_splats, sog_folder
+from hyrfpack.splats.names import find_sog_folder, is_splats
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS, SplatFormat
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
@@ -112,7 +112,7 @@ def convert_splats(
     check_type("config", config, ConvertConfig)
     check_spz_version(kind, target, config)
     check_package(kind, target)
-    Outputs(source, folder=sog_folder(source), overwrite=overwrite).file(target)
+    Outputs(source, folder=find_sog_folder(source), overwrite=overwrite).file(target)
     with context.open_progress("convert") as progress:
         return _convert(source, target, kind, config, overwrite, progress)
 
@@ -133,31 +133,33 @@ def _convert(
             f"{source}: there is no Gaussian in it, so there is nothing to convert",
             fix="name another file",
         )
-    whole = splats if config.crop is None else select_splats(splats, config.crop)
-    kept = select_splats(whole, None, config.min_opacity)
-    kept = kept.with_degree(min(kept.degree, kind.max_degree, kept.degree if config.degree is None else config.degree))
-    weighted = WeightedSplats.from_splats(whole, str(source))
-    _check_limits(kind, splats, kept, weighted.radius)
+    cropped = splats if config.crop is None else select_splats(splats, config.crop)
+    selected = select_splats(cropped, None, config.min_opacity)
+    max_degree = kind.max_degree if config.degree is None else min(kind.max_degree, config.degree)
+    selected = selected.with_degree(min(selected.degree, max_degree))
+    weighted = WeightedSplats.from_splats(cropped, str(source))
+    _check_limits(kind, splats, selected, weighted.radius)
     camera = Viewpoint.from_frame(weighted.frame.center, weighted.frame.scale).camera
     hints = Hints(camera=camera, spz_version=config.spz_version)
-    progress(TaskEvent(f"writing {format_count(len(kept), 'Gaussian')} as {kind.ending}", 0.2))
-    data = kind.encode(kept, hints)
+    progress(TaskEvent(f"writing {format_count(len(selected), 'Gaussian')} as {kind.ending}", 0.2))
+    data = kind.encode(selected, hints)
     progress(TaskEvent("reading the file back", 0.5))
-    after = kind.decode(data, str(target))
-    psnr = _measure_psnr(whole, after, weighted, part_of_progress(progress, 0.6, 0.9))
+    decoded = kind.decode(data, str(target))
+    psnr = _measure_psnr(cropped, decoded, weighted, part_of_progress(progress, 0.6, 0.9))
     if fmean(psnr) < MIN_ROUNDED_PSNR_DB and not kind.stores_floats:
-        alike = replace(after, antialiased=kept.antialiased)  # that a format cannot store this is reported above
-        rounding = _measure_psnr(kept, alike, weighted, part_of_progress(progress, 0.9, 1.0))
+        # `_check_limits` has already warned if the format cannot store `antialiased`.
+        comparable = replace(decoded, antialiased=selected.antialiased)
+        rounding = _measure_psnr(selected, comparable, weighted, part_of_progress(progress, 0.9, 1.0))
         _warn_of_rounding(kind, fmean(rounding))
-    written = write_atomic(target, data, overwrite=overwrite)
+    written_path = write_atomic(target, data, overwrite=overwrite)
     return ConversionReport(
-        file=str(written),
+        file=str(written_path),
         bytes_before=bytes_on_disk(source),
         bytes_after=len(data),
         gaussians_before=len(splats),
-        gaussians_after=len(after),
+        gaussians_after=len(decoded),
         degree_before=splats.degree,
-        degree_after=after.degree,
+        degree_after=decoded.degree,
         views=len(psnr),
         psnr=fmean(psnr),
         psnr_worst=min(psnr),
@@ -200,16 +202,16 @@ def find_target_format(source: str | os.PathLike[str], target: str | os.PathLike
     return kind
 
 
-def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats, radius: float) -> None:
+def _check_limits(kind: SplatFormat, splats: Splats, selected: Splats, radius: float) -> None:
     """Raise HyrfError for positions that the format cannot hold, and log a warning for each other loss.
 
     Args:
         kind: the format.
         splats: the splats of the source.
-        kept: those that are written.
+        selected: those that are written.
         radius: half the size of the scene, world units.
     """
-    reach = float(np.abs(kept.positions).max())
+    reach = float(np.abs(selected.positions).max())
     if reach > kind.max_coordinate:
         raise HyrfError(
             f"the splats reach {reach:,.0f} units from the origin, but {kind.ending} is limited to "
@@ -221,15 +223,15 @@ def _check_limits(kind: SplatFormat, splats: Splats, kept: Splats, radius: float
             f"{kind.ending} stores harmonics up to degree {kind.max_degree}; higher ones, up to degree "
             f"{splats.degree}, are lost"
         )
-    largest, smallest = kept.scales.max(axis=1), kept.scales.min(axis=1)
+    largest, smallest = selected.scales.max(axis=1), selected.scales.min(axis=1)
     _warn_of_clamped_scales(kind, largest > kind.max_scale, "larger", kind.max_scale)
     if kind.min_scale > MIN_VISIBLE_SCALE_RADII * radius:
         _warn_of_clamped_scales(kind, smallest < kind.min_scale, "smaller", kind.min_scale)
     if splats.antialiased and not kind.stores_antialiased:
-        able = " or ".join(row.ending for row in FORMATS.values() if row.stores_antialiased)
+        alternatives = " or ".join(row.ending for row in FORMATS.values() if row.stores_antialiased)
         _LOG.warning(
             f"{kind.ending} cannot store that the splats are antialiased: set it in the program that draws the file, "
-            f"or choose {able}"
+            f"or choose {alternatives}"
         )
 
 
@@ -246,20 +248,22 @@ def _warn_of_clamped_scales(kind: SplatFormat, is_clamped: np.ndarray, than: str
 def _warn_of_rounding(kind: SplatFormat, psnr: float) -> None:
     """Log a warning if the rounding of a format, without what was left out on purpose, leaves a low PSNR in dB."""
     if psnr < MIN_ROUNDED_PSNR_DB:
-        able = ", ".join(row.ending for row in FORMATS.values() if row.stores_floats)
+        alternatives = ", ".join(row.ending for row in FORMATS.values() if row.stores_floats)
         _LOG.warning(
             f"{kind.ending} leaves {psnr:.1f} dB, because its numbers are too coarse for this scene; choose another "
-            f"format ({able})"
+            f"format ({alternatives})"
         )
 
 
-def _measure_psnr(before: Splats, after: Splats, weighted: WeightedSplats, progress: Progress) -> list[float]:
-    """Measure the PSNR in dB of the pictures of `after` against those of `before`, for each view."""
-    original, converted = (Drawable.from_splats(splats, weighted.frame) for splats in (before, after))
+def _measure_psnr(reference: Splats, converted: Splats, weighted: WeightedSplats, progress: Progress) -> list[float]:
+    """Measure the PSNR in dB of the pictures of `converted` against those of `reference`, for each view."""
+    reference_drawable, converted_drawable = (
+        Drawable.from_splats(splats, weighted.frame) for splats in (reference, converted)
+    )
     progress(TaskEvent("choosing viewpoints", 0.0))
-    cameras = sample_viewpoints(weighted, original, MEASURED_VIEWS, MEASURED_SIZE_PIXELS, seed=0)
+    cameras = sample_viewpoints(weighted, reference_drawable, MEASURED_VIEWS, MEASURED_SIZE_PIXELS, seed=0)
     scores = []
     for number, camera in enumerate(cameras):
         progress(TaskEvent(f"comparing view {number + 1}/{len(cameras)}", 0.3 + 0.7 * number / len(cameras)))
-        scores.append(psnr_of_splats(original, converted, camera))
+        scores.append(measure_splats_psnr(reference_drawable, converted_drawable, camera))
     return scores

@@ -62,9 +62,9 @@ def choose_degree(
     views = [(shrink_camera(camera), None) for camera in evenly_spaced(validation, MAX_MEASURED_VIEWS)]
     measured = measure_psnr(model, candidates, views, sphere=False, progress=part_of_progress(progress, 0.6, 1.0))
     scores = {degree: measured[str(degree)].model for degree in baked}
-    return lowest_degree_within_tolerance(scores), scores
+    return choose_lowest_degree(scores), scores
 
 
-def lowest_degree_within_tolerance(scores: dict[int, float]) -> int:
+def choose_lowest_degree(scores: dict[int, float]) -> int:
     """Return the lowest degree whose score in dB is within SCORE_TOLERANCE_DB of the best."""
     return min(degree for degree, score in scores.items() if score >= max(scores.values()) - SCORE_TOLERANCE_DB)

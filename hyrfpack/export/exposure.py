@@ -56,8 +56,8 @@ class BakeGains:
         """
         if model.exposure is None:
             return None
-        logs = camera_log_gains(model, model.exposure, cameras)
-        typical = typical_log_gains(model.exposure, logs)
+        logs = predict_camera_log_gains(model, model.exposure, cameras)
+        typical = average_log_gains(model.exposure, logs)
         if not (logs.any() or typical.any()):
             return None
         light, sums = np.zeros(len(model)), np.zeros((len(model), 3))
@@ -69,13 +69,13 @@ class BakeGains:
         return cls(*(torch.from_numpy(np.exp(log_gains)).float() for log_gains in (logs, smooth)))
 
 
-def camera_log_gains(model: HybridModel, exposure: ExposureMap, cameras: Sequence[Camera]) -> np.ndarray:
+def predict_camera_log_gains(model: HybridModel, exposure: ExposureMap, cameras: Sequence[Camera]) -> np.ndarray:
     """Predict the log gains (V, 3) of cameras in world units."""
     gains = [exposure.predict_gains(model.config.frame.local_pose(camera)) for camera in cameras]
     return np.log(np.array(gains, np.float64).reshape(-1, 3))
 
 
-def typical_log_gains(exposure: ExposureMap, logs: np.ndarray) -> np.ndarray:
+def average_log_gains(exposure: ExposureMap, logs: np.ndarray) -> np.ndarray:
     """Return the mean (3,) of the log gains (V, 3) of cameras; the map's own mean where there are no cameras."""
     return logs.mean(0) if len(logs) else np.clip(exposure.mean, *exposure.limits).astype(np.float64)
 

@@ -20,7 +20,7 @@ from hyrfpack.checks import check_several, check_type
 from hyrfpack.counts import format_count
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
-from hyrfpack.export.pages import page_cameras, suggest_compression
+from hyrfpack.export.pages import choose_page_cameras, suggest_compression
 from hyrfpack.export.poster import (
     encode_poster,
     frame_splats,
@@ -101,14 +101,14 @@ def export_player(
     if data is not None:
         check_type("data", data, Scene)
     sources = [] if source is None else [source]
-    check_folder(folder, sources, [data], overwrite=True, is_gallery=False)
+    check_export_folder(folder, sources, [data], overwrite=True, is_gallery=False)
     with exclusive_folder(folder):
-        check_folder(folder, sources, [data], overwrite=overwrite, is_gallery=False)
+        check_export_folder(folder, sources, [data], overwrite=overwrite, is_gallery=False)
         if source is not None:
             suggest_compression(source)
-        with ExitStack() as joined:
-            file = None if source is None else joined.enter_context(single_file(source))
-            output = joined.enter_context(IndexedFolder(Path(folder), INDEX_NAME, overwrite))
+        with ExitStack() as open_resources:
+            file = None if source is None else open_resources.enter_context(single_file(source))
+            output = open_resources.enter_context(IndexedFolder(Path(folder), INDEX_NAME, overwrite))
             return _write_player(file, output, data, title, credit, editable)
 
 
@@ -122,30 +122,30 @@ def _write_player(
 ) -> ExportReport:
     """Write the files of `export_player` into a folder that the caller has locked."""
     if title is None:
-        title = _folder_title(output.path) if source is None else name_model(source)
-    content = poster = None
+        title = _name_folder(output.path) if source is None else name_model(source)
+    content_name = poster_name = None
     stages = {}
     description, count = "A player of 3D scenes", 0
     if source is not None:
         source = find_playable_file(source)
-        scene = _PlayableContent.read(source, data, with_quality=False)
-        count = scene.count
-        content, poster = _choose_file_names([source], is_gallery=False)[0]
-        output.copy(content, source)
-        stages = {content: scene.stage} if scene.stage else {}
-        if scene.poster is None:
-            poster = None
+        content = _PlayableContent.read(source, data, with_quality=False)
+        count = content.count
+        content_name, poster_name = _choose_file_names([source], is_gallery=False)[0]
+        output.copy(content_name, source)
+        stages = {content_name: content.stage} if content.stage else {}
+        if content.poster is None:
+            poster_name = None
         else:
-            output.write(poster, encode_poster(scene.poster, "JPEG", MAX_POSTER_BYTES))
-        description = f"{format_count(count, 'Gaussian')}, {scene.length:,} bytes"
+            output.write(poster_name, encode_poster(content.poster, "JPEG", MAX_POSTER_BYTES))
+        description = f"{format_count(count, 'Gaussian')}, {content.length:,} bytes"
     output.write(ELEMENT_SCRIPT_NAME, encode_element_script())
-    output.write(README_NAME, encode_readme(title, INDEX_NAME, INDEX_NAME, element=content or "URL"))
+    output.write(README_NAME, encode_readme(title, INDEX_NAME, INDEX_NAME, element=content_name or "URL"))
     for name, encoded in encode_player_files(editable).items():
         output.write(name, encoded)
     page = encode_player(
         title,
-        content=content,
-        poster=poster,
+        content=content_name,
+        poster=poster_name,
         description=description,
         stages=stages,
         in_folder=True,
@@ -203,14 +203,14 @@ def export_gallery(
     for scene in scenes:
         if scene is not None:
             check_type("data", scene, Scene)
-    check_folder(folder, sources, scenes, overwrite=True, is_gallery=True)
+    check_export_folder(folder, sources, scenes, overwrite=True, is_gallery=True)
     with exclusive_folder(folder):
-        check_folder(folder, sources, scenes, overwrite=overwrite, is_gallery=True)
-        with ExitStack() as joined:
+        check_export_folder(folder, sources, scenes, overwrite=overwrite, is_gallery=True)
+        with ExitStack() as open_resources:
             for source in sources:
                 suggest_compression(source)
-            files = [joined.enter_context(single_file(source)) for source in sources]
-            output = joined.enter_context(IndexedFolder(Path(folder), INDEX_NAME, overwrite))
+            files = [open_resources.enter_context(single_file(source)) for source in sources]
+            output = open_resources.enter_context(IndexedFolder(Path(folder), INDEX_NAME, overwrite))
             return _write_gallery(sources, files, output, scenes, title, credit, editable)
 
 
@@ -235,17 +235,17 @@ def _write_gallery(
         _LOG.info(f"reading {source}")
         contents.append(_PlayableContent.read(file, scene, with_quality=True))
     cards = []
-    for source, file, shown, (content, poster) in zip(
+    for source, file, content, (content_name, poster_name) in zip(
         sources, playable, contents, _choose_file_names(sources, is_gallery=True), strict=True
     ):
-        output.copy(content, file)
-        if shown.poster is not None:
-            output.write(poster, encode_poster(shown.poster, "JPEG", MAX_POSTER_BYTES))
-        picture = None if shown.poster is None else poster
-        cards.append(Card(_name_source(source), content, picture, shown.count, shown.length, shown.quality))
-    title = _folder_title(output.path) if title is None else title
+        output.copy(content_name, file)
+        if content.poster is not None:
+            output.write(poster_name, encode_poster(content.poster, "JPEG", MAX_POSTER_BYTES))
+        picture = None if content.poster is None else poster_name
+        cards.append(Card(_name_source(source), content_name, picture, content.count, content.length, content.quality))
+    title = _name_folder(output.path) if title is None else title
     pairs = zip(cards, contents, strict=True)
-    stages = {card.content: shown.stage for card, shown in pairs if shown.stage}
+    stages = {card.content: content.stage for card, content in pairs if content.stage}
     for name, encoded in encode_player_files(editable).items():
         output.write(name, encoded)
     page = encode_player(title, stages=stages, gallery=INDEX_NAME, in_folder=True, credit=credit, editable=editable)
@@ -256,7 +256,7 @@ def _write_gallery(
     return ExportReport(str(output.path), output.bytes, sum(card.count for card in cards), native=True)
 
 
-def check_folder(
+def check_export_folder(
     folder: StrPath, sources: Sequence[StrPath], scenes: Sequence[Scene | None], *, overwrite: bool, is_gallery: bool
 ) -> None:
     """Check that `export_player`, or `export_gallery` if `is_gallery`, may write into a folder.
@@ -308,7 +308,7 @@ class _PlayableContent:
             HyrfError: the file cannot be read.
         """
         length = os.path.getsize(path) if os.path.isfile(path) else 0
-        if _playable_ending(path) != HYRF_ENDING:
+        if _choose_ending(path) != HYRF_ENDING:
             splats = read_splats(path)
             frame = frame_splats(splats)
             if frame is None:
@@ -319,10 +319,10 @@ class _PlayableContent:
             return cls(len(splats), length, poster, stage=stage)
         data = place_photos(describe_file(path), data)
         loaded = Source.read(path, data)
-        quality = _describe_quality(path, loaded.drawn, data) if with_quality else ""
-        cameras = page_cameras(loaded)
-        poster = render_model_poster(loaded.drawn, cameras[0], POSTER_LONGEST_SIDE_PIXELS)
-        return cls(len(loaded.drawn), length, poster, quality, encode_stage(cameras, loaded.up, loaded.center))
+        quality = _describe_quality(path, loaded.all_parts, data) if with_quality else ""
+        cameras = choose_page_cameras(loaded)
+        poster = render_model_poster(loaded.all_parts, cameras[0], POSTER_LONGEST_SIDE_PIXELS)
+        return cls(len(loaded.all_parts), length, poster, quality, encode_stage(cameras, loaded.up, loaded.center))
 
 
 def _describe_quality(path: StrPath, model: HybridModel | MergedModel, data: Scene | None) -> str:
@@ -335,11 +335,11 @@ def _describe_quality(path: StrPath, model: HybridModel | MergedModel, data: Sce
         return ""
     facts = describe_file(path)
     provenance = facts["provenance"]
-    stated, choices = provenance.get("psnr"), provenance.get("choices")
-    if type(stated) not in (int, float) or not 0 < stated < IDENTICAL_PSNR:
+    stated_psnr, choices = provenance.get("psnr"), provenance.get("choices")
+    if type(stated_psnr) not in (int, float) or not 0 < stated_psnr < IDENTICAL_PSNR:
         return ""
     imported = isinstance(choices, dict) and "imported" in choices
-    quality = f"{stated:.1f} dB " + ("against the splats it was made of" if imported else "on its training photos")
+    quality = f"{stated_psnr:.1f} dB " + ("against the splats it was made of" if imported else "on its training photos")
     # Earlier versions did not store that a model was scored before compression. Training writes profile "raw".
     is_trained_and_compressed = not imported and facts["profile"] != "raw"
     change = provenance.get(PSNR_BEFORE_KEY)
@@ -351,14 +351,14 @@ def _describe_quality(path: StrPath, model: HybridModel | MergedModel, data: Sce
 def _choose_file_names(sources: Sequence[StrPath], *, is_gallery: bool) -> list[tuple[str, str]]:
     """Choose names for the files and their posters that are distinct on any file system and need no quoting."""
     if not is_gallery:
-        return [(f"{DEFAULT_SCENE_STEM}{_playable_ending(source)}", POSTER_NAME) for source in sources]
+        return [(f"{DEFAULT_SCENE_STEM}{_choose_ending(source)}", POSTER_NAME) for source in sources]
     names: list[str] = []
     for source in sources:
         stem = re.sub(r"[^\w.-]+", "-", _name_source(source)).strip("-.") or DEFAULT_SCENE_STEM
-        taken = {name.casefold() for name in names}
+        used_names = {name.casefold() for name in names}
         numbered = (stem if number == 1 else f"{stem}-{number}" for number in count_up(1))
-        names.append(next(name for name in numbered if name.casefold() not in taken))
-    return [(f"{name}{_playable_ending(source)}", f"{name}.jpg") for name, source in zip(names, sources, strict=True)]
+        names.append(next(name for name in numbered if name.casefold() not in used_names))
+    return [(f"{name}{_choose_ending(source)}", f"{name}.jpg") for name, source in zip(names, sources, strict=True)]
 
 
 def _name_source(source: StrPath) -> str:
@@ -366,11 +366,11 @@ def _name_source(source: StrPath) -> str:
     return name_model(SceneFolder(source).path if is_scene(source) else source) or DEFAULT_SCENE_STEM
 
 
-def _playable_ending(path: StrPath) -> str:
+def _choose_ending(path: StrPath) -> str:
     """Return the ending of a file to be played; ".hyrf" for folders and for all files without an ending of splats."""
     ending = Path(path).suffix.lower()
     return ending if ending in READABLE_ENDINGS and not os.path.isdir(path) else HYRF_ENDING
 
 
-def _folder_title(folder: StrPath) -> str:
+def _name_folder(folder: StrPath) -> str:
     return Path(os.path.abspath(folder)).name or "hyrfpack"

@@ -14,7 +14,7 @@ import torch
 from hyrfpack.choices import DEFAULT_SPZ_VERSION, LOCAL_EXPOSURE, SPZ_TILE_CONTENT
 from hyrfpack.config.export import ConvertConfig, ExportConfig
 from hyrfpack.errors import HyrfError, needs_package, suggest_command
-from hyrfpack.export.background import background_reach
+from hyrfpack.export.background import compute_background_reach
 from hyrfpack.export.cameras import COLMAP_FILES
 from hyrfpack.export.source import Source
 from hyrfpack.model.merged import world_positions
@@ -70,13 +70,13 @@ def find_file_kind(
             ".collision" and another format; or `config` names two kinds of folders.
     """
     name = Path(target).name.lower()
-    asked = [(setting, kind) for setting, kind in _FOLDERS_BY_SETTING.items() if getattr(config, setting)]
-    if len(asked) > 1:
+    requested_kinds = [(setting, kind) for setting, kind in _FOLDERS_BY_SETTING.items() if getattr(config, setting)]
+    if len(requested_kinds) > 1:
         raise HyrfError(
             f"{target}: one export writes one kind of folder",
-            fix="give only one of " + " and ".join(f"`{setting}=True`" for setting, _ in asked),
+            fix="give only one of " + " and ".join(f"`{setting}=True`" for setting, _ in requested_kinds),
         )
-    for setting, kind in asked:
+    for setting, kind in requested_kinds:
         if name.endswith(EXPORT_ENDINGS) and not os.path.isdir(target):
             raise HyrfError(
                 f"{target}: this format is a folder of files, not one file",
@@ -84,8 +84,8 @@ def find_file_kind(
             )
         is_spz = kind is TILES_FOLDER and config.tile_content == SPZ_TILE_CONTENT
         return SPZ_TILES_FOLDER if is_spz else kind
-    if (named := find_kind_by_ending(target)) is not None:
-        return named
+    if (kind_of_ending := find_kind_by_ending(target)) is not None:
+        return kind_of_ending
     if os.path.isdir(target) or not Path(name).suffix:
         return PLAYER_FOLDER
     raise HyrfError(
@@ -121,6 +121,17 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
     Raises:
         HyrfError: the settings contradict the kind, or a package is missing.
     """
+    _check_content_settings(kind, target, config)
+    _check_mesh_settings(kind, target, config)
+    _check_page_settings(kind, target, config)
+    check_package(kind, target)
+    if config.faces is not None or kind in COLLISION_FILES:
+        with needs_package(f"{target}: reducing the triangles of a mesh"):
+            import_module("fast_simplification")
+
+
+def _check_content_settings(kind: FileKind, target: str | os.PathLike[str], config: ExportConfig) -> None:
+    """Raise HyrfError for settings of Gaussians, colours, SPZ or 3D Tiles that a kind of file cannot follow."""
     if kind is TRANSFORMS_JSON and (config.crop is not None or config.min_opacity > 0 or not config.background):
         raise HyrfError(
             f"{target}: this file holds only cameras, so that nothing can be left out",
@@ -141,6 +152,10 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
             f"{target}: only 3D Tiles have a choice of contents",
             fix="leave out `tile_content`, or write a folder with `tiles_3d=True`",
         )
+
+
+def _check_mesh_settings(kind: FileKind, target: str | os.PathLike[str], config: ExportConfig) -> None:
+    """Raise HyrfError for settings of meshes with a kind of file that holds none."""
     is_mesh = kind in (*MESH_FILES, *COLLISION_FILES)
     if not is_mesh and (config.voxel is not None or config.faces is not None):
         names = " and ".join(f"`{name}`" for name in ("voxel", "faces") if getattr(config, name) is not None)
@@ -148,6 +163,10 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
             f"{target}: this is not a mesh, which has voxels and triangles",
             fix=f"leave out {names}, or use one of {', '.join(row.ending for row in (*MESH_FILES, *COLLISION_FILES))}",
         )
+
+
+def _check_page_settings(kind: FileKind, target: str | os.PathLike[str], config: ExportConfig) -> None:
+    """Raise HyrfError for settings of pages with other kinds, and for those of baked splats with the model itself."""
     if config.baked and kind is PLAYER_FOLDER:
         raise HyrfError(
             f"{target}: the folder of a player holds the model file itself and no baked splats",
@@ -159,34 +178,30 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
             fix="leave out `baked`",
         )
     texts = {"`title`": config.title, "`credit`": config.credit}
-    given = " and ".join(name for name, text in texts.items() if text)
-    if given and kind not in (HTML_PAGE, PLAYER_FOLDER):
+    given_texts = " and ".join(name for name, text in texts.items() if text)
+    if given_texts and kind not in (HTML_PAGE, PLAYER_FOLDER):
         raise HyrfError(
             f"{target}: only pages show a title and a credit",
-            fix=f"leave out {given}, or write a page (.html) or a player's folder",
+            fix=f"leave out {given_texts}, or write a page (.html) or a player's folder",
         )
     if config.editable and (kind not in (HTML_PAGE, PLAYER_FOLDER) or config.baked):
         raise HyrfError(
             f"{target}: only pages of the model itself can edit it",
             fix="leave out `editable`, or write a page (.html) without `baked`, or a player's folder",
         )
-    asked = {
+    is_changed = {
         "`degree`": config.degree is not None,
         "`crop`": config.crop is not None,
         "`min_opacity`": config.min_opacity > 0,
         "`background=False`": not config.background,
         f"`exposure={config.exposure!r}`": config.exposure != LOCAL_EXPOSURE,
     }
-    if any(asked.values()) and (kind is PLAYER_FOLDER or (kind is HTML_PAGE and not config.baked)):
-        names = " and ".join(name for name, given in asked.items() if given)
+    if any(is_changed.values()) and (kind is PLAYER_FOLDER or (kind is HTML_PAGE and not config.baked)):
+        names = " and ".join(name for name, changed in is_changed.items() if changed)
         raise HyrfError(
             f"{target}: the output holds the whole model, which these settings cannot change",
             fix=f"leave out {names}, or write baked splats into a page with `baked=True`",
         )
-    check_package(kind, target)
-    if config.faces is not None or kind in COLLISION_FILES:
-        with needs_package(f"{target}: reducing the triangles of a mesh"):
-            import_module("fast_simplification")
 
 
 def check_spz_version(kind: FileKind, target: str | os.PathLike[str], config: ConvertConfig) -> None:
@@ -202,12 +217,16 @@ def check_package(kind: FileKind, target: str | os.PathLike[str]) -> None:
             import_module(kind.module)
 
 
-def check_place(
+def check_export_target(
     target: str | os.PathLike[str],
     outputs: Outputs,
     config: ExportConfig = ExportConfig(),  # noqa: B008 - frozen
 ) -> None:
-    """Check that a target other than a player's folder may be written. Raises HyrfError otherwise."""
+    """Check that a target other than a player's folder may be written.
+
+    Raises:
+        HyrfError: a file must not be replaced or cannot be written.
+    """
     kind = find_file_kind(target, config)
     if kind is COLMAP_FOLDER:
         outputs.folder(target, COLMAP_FILES)
@@ -229,11 +248,12 @@ def check_model(loaded: Source, kind: FileKind, config: ExportConfig) -> None:
     Raises:
         HyrfError: the settings leave no Gaussian, or the scene is too far from the origin.
     """
-    model, frame = loaded.drawn, loaded.model.config.frame
+    model, frame = loaded.all_parts, loaded.model.config.frame
     positions = world_positions(model)
     crop, min_opacity = config.crop, config.min_opacity
     if crop is not None or min_opacity > 0:  # certain before the bake, because it raises no opacity
-        positions = positions[selection_mask(positions, model.decode_geometry().opacities.numpy(), crop, min_opacity)]
+        opacities = model.decode_geometry().opacities.numpy()
+        positions = positions[make_selection_mask(positions, opacities, crop, min_opacity)]
     reach, limit = float(np.abs(positions).max()), f"but {kind.ending} is limited to {kind.max_coordinate:,}"
     if reach > kind.max_coordinate:
         low, high = positions.min(axis=0), positions.max(axis=0)
@@ -245,7 +265,7 @@ def check_model(loaded: Source, kind: FileKind, config: ExportConfig) -> None:
             f"the Gaussians reach {reach:,.0f} units from the origin, {limit}",
             fix=f"choose another format, or {remedy}",
         )
-    if includes_background(loaded, kind, config) and (reach := background_reach(frame)) > kind.max_coordinate:
+    if includes_background(loaded, kind, config) and (reach := compute_background_reach(frame)) > kind.max_coordinate:
         raise HyrfError(
             f"the scene reaches {reach:,.0f} units from the origin with its background, {limit}",
             fix="choose another format, or leave out the background with `background=False`",
@@ -258,11 +278,11 @@ def select_splats(splats: Splats, crop: Sequence[float] | None = None, min_opaci
     Raises:
         HyrfError: no splat is left.
     """
-    keep = selection_mask(splats.positions, splats.opacities, crop, min_opacity)
+    keep = make_selection_mask(splats.positions, splats.opacities, crop, min_opacity)
     return splats if keep.all() else splats[keep]
 
 
-def selection_mask(
+def make_selection_mask(
     positions: np.ndarray, opacities: np.ndarray, crop: Sequence[float] | None, min_opacity: float
 ) -> np.ndarray:
     """Return a mask (N,) of the Gaussians that `select_splats` keeps, given positions (N, 3) and opacities (N,).

@@ -113,7 +113,7 @@ def bake_levels(
         model = scene.load(chosen)
         # Without views to measure at, splats of another exposure are not baked for comparison.
         coarse = bake_scene(
-            replace(loaded, model=scene_of(model), drawn=model, measured_views=[]),
+            replace(loaded, model=scene_of(model), all_parts=model, measured_views=[]),
             kind,
             settings,
             part_of_progress(progress, start, end),
@@ -140,5 +140,5 @@ def _divide(splats: Splats, index: np.ndarray, chunks: Sequence[Chunk], levels: 
     order = sorted(range(len(chunks)), key=lambda number: chunks[number].part)
     sizes = [chunks[number].levels[levels[number]].gaussians for number in order]
     edges = np.searchsorted(index, np.concatenate(([0], np.cumsum(sizes)))).tolist()
-    runs = dict(zip(order, zip(edges, edges[1:], strict=False), strict=True))
-    return [splats[slice(*runs[number])] for number in range(len(chunks))]
+    row_ranges = dict(zip(order, zip(edges, edges[1:], strict=False), strict=True))
+    return [splats[slice(*row_ranges[number])] for number in range(len(chunks))]

@@ -52,7 +52,7 @@ def measure_psnr(
     Args:
         model: the model from which the splats were baked. It is scored, too, under the name "model".
         candidates: splats by name, each with its background: an equirectangular picture (H, 2H, 3) as
-            `background_picture` makes it, or None for the model's solid colour.
+            `render_background_picture` makes it, or None for the model's solid colour.
         views: cameras, with their photos or None. Photos are scored if all views have them.
         sphere: whether the model is rendered with its background sphere.
         progress: called with `TaskEvent`s.
@@ -67,13 +67,13 @@ def measure_psnr(
     }
 
     @torch.no_grad()  # because torch keeps this setting per thread
-    def scores_at(viewpoint: tuple[Camera, View | None]) -> dict[str, tuple[float, float | None]]:
+    def score_view(viewpoint: tuple[Camera, View | None]) -> dict[str, tuple[float, float | None]]:
         camera, view = viewpoint
         model_picture = to_8bit(render_view(model, camera, decoded=decoded, background=sphere).rgb)
         pictures = {"model": model_picture}
         for name, (drawable, panorama) in drawables.items():
             raster = draw(drawable, camera)
-            backdrop = solid if panorama is None else _equirect_colors(torch.from_numpy(panorama), camera)
+            backdrop = solid if panorama is None else _sample_panorama(torch.from_numpy(panorama), camera)
             pictures[name] = to_8bit(raster.rgb + raster.transmittance[..., None] * backdrop)
         photo, mask = (None, None) if view is None else _load_photo(view, config.solid)
         if mask is not None and not mask.any():
@@ -83,16 +83,14 @@ def measure_psnr(
             for name, picture in pictures.items()
         }
 
-    compare = count_calls(scores_at, progress, "comparing renders with those of the model", len(views))
+    compare = count_calls(score_view, progress, "comparing renders with those of the model", len(views))
     scores = [view_scores for view_scores in parallel_map(compare, views) if view_scores]
-    return (
-        {name: _mean_scores([view_scores[name] for view_scores in scores]) for name in ("model", *drawables)}
-        if scores
-        else {}
-    )
+    if not scores:
+        return {}
+    return {name: _average_scores([view_scores[name] for view_scores in scores]) for name in ("model", *drawables)}
 
 
-def _equirect_colors(picture: Tensor, camera: Camera) -> Tensor:
+def _sample_panorama(picture: Tensor, camera: Camera) -> Tensor:
     """Return an equirectangular picture as a camera sees it at infinite distance, (H, W, 3)."""
     height, width, _ = picture.shape
     rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
@@ -116,13 +114,13 @@ def _load_photo(view: View, solid: tuple[float, float, float]) -> tuple[Tensor, 
     return photo, None if picture.mask is None else torch.from_numpy(picture.mask)
 
 
-def _mean_scores(scores: Sequence[tuple[float, float | None]]) -> PsnrScores:
+def _average_scores(scores: Sequence[tuple[float, float | None]]) -> PsnrScores:
     model, photos = zip(*scores, strict=True)
     return PsnrScores(fmean(model), None if None in photos else fmean(photos), len(scores))
 
 
 @torch.no_grad()
-def psnr_of_splats(before: Drawable, after: Drawable, camera: Camera) -> float:
-    """Return the PSNR in dB of a camera's picture of `after` against that of `before`, both over black."""
-    picture, reference = (to_8bit(draw(drawable, camera).rgb) for drawable in (after, before))
-    return psnr(picture, reference)
+def measure_splats_psnr(reference: Drawable, candidate: Drawable, camera: Camera) -> float:
+    """Measure the PSNR in dB of a camera's picture of `candidate` against that of `reference`, both over black."""
+    picture, reference_picture = (to_8bit(draw(drawable, camera).rgb) for drawable in (candidate, reference))
+    return psnr(picture, reference_picture)

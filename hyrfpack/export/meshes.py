@@ -11,7 +11,7 @@ import torch
 from hyrfpack.atomic import write_atomic
 from hyrfpack.choices import AS_PHOTOGRAPHED, CONSISTENT_EXPOSURE
 from hyrfpack.config.export import DEFAULT_COLLISION_FACES, ExportConfig
-from hyrfpack.export.kinds import selection_mask
+from hyrfpack.export.kinds import make_selection_mask
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
 from hyrfpack.mesh import Mesh, extract_mesh
@@ -43,10 +43,12 @@ def write_mesh(
     Raises:
         HyrfError: no surface is in view, the voxels are too small, a package is missing, or the file cannot be written.
     """
-    mesh = _extract(loaded, config, config.faces, colored=True, progress=progress)
+    mesh = _extract_opaque_surface(loaded, config, config.faces, colored=True, progress=progress)
     data = encode_mesh(mesh, kind.ending.rpartition(".")[2], loaded.up)
-    written = write_atomic(target, data, overwrite=overwrite)
-    return ExportReport(str(written), len(data), vertices=len(mesh.vertices), faces=len(mesh.faces), voxel=mesh.voxel)
+    written_path = write_atomic(target, data, overwrite=overwrite)
+    return ExportReport(
+        str(written_path), len(data), vertices=len(mesh.vertices), faces=len(mesh.faces), voxel=mesh.voxel
+    )
 
 
 def write_collision_mesh(
@@ -61,36 +63,39 @@ def write_collision_mesh(
 
     Arguments and errors are those of `write_mesh`; `kind` is one of `kinds.COLLISION_FILES`.
     """
-    mesh = _extract(loaded, config, None, colored=False, progress=part_of_progress(progress, 0, 0.8))
+    mesh = _extract_opaque_surface(loaded, config, None, colored=False, progress=part_of_progress(progress, 0, 0.8))
     progress(TaskEvent("closing the surface", 0.8))
     count = DEFAULT_COLLISION_FACES if config.faces is None else config.faces
     proxy = make_proxy(mesh.vertices, mesh.faces, mesh.voxel, count)
     closed = replace(mesh, vertices=proxy.vertices, faces=proxy.faces)
     data = encode_mesh(closed, kind.ending.rpartition(".")[2], loaded.up)
-    written = write_atomic(target, data, overwrite=overwrite)
+    written_path = write_atomic(target, data, overwrite=overwrite)
     return ExportReport(
-        str(written),
+        str(written_path),
         len(data),
         vertices=len(proxy.vertices),
         faces=len(proxy.faces),
         voxel=mesh.voxel,
         wall=proxy.wall,
-        surface_to_mesh=_mean_and_95(proxy.surface_distances),
-        mesh_to_surface=_mean_and_95(proxy.proxy_distances),
+        surface_to_mesh=_summarize_distances(proxy.surface_distances),
+        mesh_to_surface=_summarize_distances(proxy.proxy_distances),
     )
 
 
-def _mean_and_95(distances: np.ndarray) -> tuple[float, float]:
+def _summarize_distances(distances: np.ndarray) -> tuple[float, float]:
+    """Return the mean and the 95th percentile of distances."""
     return float(distances.mean()), float(np.quantile(distances, 0.95))
 
 
-def _extract(loaded: Source, config: ExportConfig, faces: int | None, colored: bool, progress: Progress) -> Mesh:
+def _extract_opaque_surface(
+    loaded: Source, config: ExportConfig, faces: int | None, colored: bool, progress: Progress
+) -> Mesh:
     """Extract the surface of the Gaussians that are opaque enough."""
-    model = loaded.drawn
+    model = loaded.all_parts
     if config.min_opacity > 0:
         with torch.no_grad():
             opacities = model.decode_geometry().opacities.numpy()
-        keep = selection_mask(world_positions(model), opacities, None, config.min_opacity)
+        keep = make_selection_mask(world_positions(model), opacities, None, config.min_opacity)
         model = model.subset(torch.from_numpy(keep).nonzero()[:, 0])
     return extract_mesh(
         model,

@@ -39,15 +39,15 @@ MAX_POSTER_BYTES = 9_000  # before base64, which adds a third
 LARGE_FILE_BYTES = 20_000_000  # larger files take long to load on many connections
 
 
-def page_cameras(loaded: Source) -> list[Camera]:
+def choose_page_cameras(loaded: Source) -> list[Camera]:
     """Choose the cameras that a page steps through: up to MAX_PAGE_CAMERAS known ones, or made-up ones.
 
     The page starts at the first camera whose picture has enough detail, compared with the other pictures: a camera in
     haze, or one that looks away from the scene, sees little. The cameras before it come last.
     """
-    known = [camera for _, camera in loaded.cameras] or [camera for camera, _ in loaded.measured_views]
-    cameras = evenly_spaced(known, MAX_PAGE_CAMERAS)
-    start = choose_start(measure_detail(loaded.drawn, cameras))
+    known_cameras = [camera for _, camera in loaded.cameras] or [camera for camera, _ in loaded.measured_views]
+    cameras = evenly_spaced(known_cameras, MAX_PAGE_CAMERAS)
+    start = choose_start(measure_detail(loaded.all_parts, cameras))
     return cameras[start:] + cameras[:start]
 
 
@@ -60,8 +60,8 @@ def choose_start(details: Sequence[float]) -> int:
     Returns:
         An index into `details`, 0 if no picture has any detail.
     """
-    wanted = MIN_START_DETAIL_RATIO * median(details)
-    return next((index for index, detail in enumerate(details) if detail >= wanted), 0)
+    min_detail = MIN_START_DETAIL_RATIO * median(details)
+    return next((index for index, detail in enumerate(details) if detail >= min_detail), 0)
 
 
 @torch.no_grad()
@@ -84,14 +84,14 @@ def encode_baked_page(
     Args:
         loaded: the model with its cameras.
         splats: the baked splats.
-        picture: (H, 2H, 3) background of the model, see `background_picture`; None for its solid colour.
+        picture: (H, 2H, 3) background of the model, see `render_background_picture`; None for its solid colour.
         title: title of the page.
         credit: text below the title.
     """
     frame = loaded.model.config.frame
-    near, sphere = RenderSettings().near * frame.scale, (frame.center, BACKGROUND_RADIUS * frame.scale)
-    settings = _page_settings(loaded, title, credit)
-    return encode_splats_page(splats, background=picture, near=near, sphere=sphere, **settings)
+    near_plane, sphere = RenderSettings().near * frame.scale, (frame.center, BACKGROUND_RADIUS * frame.scale)
+    settings = _collect_page_settings(loaded, title, credit)
+    return encode_splats_page(splats, background=picture, near=near_plane, sphere=sphere, **settings)
 
 
 def encode_native_page(
@@ -106,8 +106,8 @@ def encode_native_page(
         credit: text below the title.
         editable_file: as for `encode_model_page`.
     """
-    settings = _page_settings(loaded, title, credit)
-    frame, count = loaded.model.config.frame, len(loaded.drawn)
+    settings = _collect_page_settings(loaded, title, credit)
+    frame, count = loaded.model.config.frame, len(loaded.all_parts)
     return encode_model_page(data, count=count, frame=frame, editable_file=editable_file, **settings)
 
 
@@ -126,8 +126,8 @@ def write_native_page(
     data = Path(source).read_bytes()
     title = Path(target).stem if config.title is None else config.title
     page = encode_native_page(loaded, data, title, config.credit, Path(source).name if config.editable else None)
-    written = write_atomic(target, page, overwrite=overwrite)
-    return ExportReport(str(written), len(page), len(loaded.drawn), native=True)
+    written_path = write_atomic(target, page, overwrite=overwrite)
+    return ExportReport(str(written_path), len(page), len(loaded.all_parts), native=True)
 
 
 def suggest_compression(source: str | os.PathLike[str]) -> None:
@@ -140,9 +140,9 @@ def suggest_compression(source: str | os.PathLike[str]) -> None:
         _LOG.info(f"{file} is copied unchanged, {facts['bytes']:,} bytes; 'hyrfpack compress' makes it smaller")
 
 
-def _page_settings(loaded: Source, title: str, credit: str) -> dict[str, Any]:
+def _collect_page_settings(loaded: Source, title: str, credit: str) -> dict[str, Any]:
     """Collect the arguments that both kinds of page share: texts, cameras, axes, background colour and poster."""
-    cameras = page_cameras(loaded)
+    cameras = choose_page_cameras(loaded)
     return {
         "title": title,
         "credit": credit,
@@ -151,6 +151,6 @@ def _page_settings(loaded: Source, title: str, credit: str) -> dict[str, Any]:
         "center": loaded.center,
         "solid": loaded.model.config.solid,
         "poster": encode_poster(
-            render_model_poster(loaded.drawn, cameras[0], POSTER_LONGEST_SIDE_PIXELS), "WEBP", MAX_POSTER_BYTES
+            render_model_poster(loaded.all_parts, cameras[0], POSTER_LONGEST_SIDE_PIXELS), "WEBP", MAX_POSTER_BYTES
         ),
     }

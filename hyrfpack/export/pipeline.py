@@ -16,7 +16,7 @@ from hyrfpack.config.export import ExportConfig
 from hyrfpack.context import RunContext
 from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfError
-from hyrfpack.export.baked_scene import BakedScene, ShownSplats, bake_scene
+from hyrfpack.export.baked_scene import BakedScene, SplatsWithBackground, bake_scene
 from hyrfpack.export.cameras import encode_transforms, fit_to_file, locate_photo, write_colmap
 from hyrfpack.export.folder import export_player
 from hyrfpack.export.kinds import (
@@ -29,8 +29,8 @@ from hyrfpack.export.kinds import (
     POSITION_KINDS,
     STREAMED_SOG_FOLDER,
     TRANSFORMS_JSON,
+    check_export_target,
     check_model,
-    check_place,
     check_request,
     find_file_kind,
 )
@@ -154,9 +154,9 @@ def _export_file(
     folder = find_input_folder(model)
     is_folder = kind is COLMAP_FOLDER or kind in LEVEL_FOLDERS
     if is_folder:
-        check_place(target, Outputs(model, folder=folder, scene=data, overwrite=True), config)
+        check_export_target(target, Outputs(model, folder=folder, scene=data, overwrite=True), config)
     with exclusive_folder(target) if is_folder else nullcontext():
-        check_place(target, Outputs(model, folder=folder, scene=data, overwrite=overwrite), config)
+        check_export_target(target, Outputs(model, folder=folder, scene=data, overwrite=overwrite), config)
         data = place_photos(describe_file(source), data)
         loaded = Source.read(source, data)
         if kind is HTML_PAGE and not config.baked:
@@ -188,11 +188,11 @@ def _export_gaussians(
     count = len(baked.splats) - baked.background_count
     _LOG.info(f"writing {format_count(count, 'Gaussian')}{' and the background' if baked.sphere else ''}")
     progress(TaskEvent(f"writing {format_count(count, 'Gaussian')}", 0.5))
-    result, written = _write_splats(baked, target, kind, config, overwrite)
+    result, decoded = _write_splats(baked, target, kind, config, overwrite)
     if config.crop is not None:
         _LOG.info("quality is not measured, because a part of the scene was cropped")
         return result
-    return measure_export(result, loaded, baked, written, kind, part_of_progress(progress, 0.65, 1.0))
+    return measure_export(result, loaded, baked, decoded, kind, part_of_progress(progress, 0.65, 1.0))
 
 
 def _export_levels(
@@ -209,11 +209,11 @@ def _export_levels(
     baked = bake_levels(loaded, scene, kind, config, part_of_progress(progress, 0.0, 0.6))
     _LOG.info(f"writing {format_count(len(baked.chunks), 'chunk')}")
     write = write_streamed_sog if kind is STREAMED_SOG_FOLDER else partial(write_tiles, kind)
-    size, written = write(baked, target, overwrite, part_of_progress(progress, 0.6, 0.8))
+    size, decoded = write(baked, target, overwrite, part_of_progress(progress, 0.6, 0.8))
     report = replace(
         _describe_splats(baked.finest, target, size), chunks=len(baked.chunks), level_gaussians=baked.level_gaussians
     )
-    return measure_export(report, loaded, baked.finest, written, kind, part_of_progress(progress, 0.8, 1.0))
+    return measure_export(report, loaded, baked.finest, decoded, kind, part_of_progress(progress, 0.8, 1.0))
 
 
 def _check_cameras(loaded: Source, source: str | os.PathLike[str], data: Scene | None) -> None:
@@ -222,9 +222,9 @@ def _check_cameras(loaded: Source, source: str | os.PathLike[str], data: Scene |
     It warns if nobody knows which photo a camera belongs to.
     """
     if not loaded.cameras or loaded.has_coarse_cameras:
-        kept = "only coarse cameras" if loaded.has_coarse_cameras else "no cameras"
+        stored_cameras = "only coarse cameras" if loaded.has_coarse_cameras else "no cameras"
         raise HyrfError(
-            f"{source}: it keeps {kept}",
+            f"{source}: it keeps {stored_cameras}",
             fix="export the cameras from the file that training wrote, or give the photos with `data`",
         )
     if data is None or not data.train:
@@ -248,47 +248,47 @@ def _check_cameras(loaded: Source, source: str | os.PathLike[str], data: Scene |
 def _write_cameras(loaded: Source, target: str | os.PathLike[str], data: Scene | None, overwrite: bool) -> ExportReport:
     """Write the cameras as a transforms.json, for the photo files if they are known."""
     folder, views = Path(target).parent, [] if data is None else data.train
-    named = [(locate_photo(view, folder), fit_to_file(view)) for view in views]
-    encoded = encode_transforms(named or [(f"images/{name}", camera) for name, camera in loaded.cameras])
-    written = write_atomic(target, encoded, overwrite=overwrite)
-    return ExportReport(str(written), len(encoded), cameras=len(loaded.cameras))
+    named_cameras = [(locate_photo(view, folder), fit_to_file(view)) for view in views]
+    encoded = encode_transforms(named_cameras or [(f"images/{name}", camera) for name, camera in loaded.cameras])
+    written_path = write_atomic(target, encoded, overwrite=overwrite)
+    return ExportReport(str(written_path), len(encoded), cameras=len(loaded.cameras))
 
 
 def _write_points(baked: BakedScene, target: Path, kind: FileKind, overwrite: bool) -> ExportReport:
     """Write the centres of splats as points, and the cameras."""
-    named, up = baked.source.cameras, baked.source.up
+    named_cameras, up = baked.source.cameras, baked.source.up
     if kind is COLMAP_FOLDER:
-        write_colmap(named, target, baked.splats, overwrite=overwrite)
+        write_colmap(named_cameras, target, baked.splats, overwrite=overwrite)
         size = sum(table.stat().st_size for table in Path(target, "sparse", "0").glob("*.bin"))
-        return ExportReport(str(target), size, cameras=len(named))
-    cameras = [camera for _, camera in named]
+        return ExportReport(str(target), size, cameras=len(named_cameras))
+    cameras = [camera for _, camera in named_cameras]
     data = encode_points(baked.splats, cameras, "glb" if kind.ending.endswith("glb") else "ply", up)
-    written = write_atomic(target, data, overwrite=overwrite)
-    return ExportReport(str(written), len(data), len(baked.splats), cameras=len(named))
+    written_path = write_atomic(target, data, overwrite=overwrite)
+    return ExportReport(str(written_path), len(data), len(baked.splats), cameras=len(named_cameras))
 
 
 def _write_splats(
     baked: BakedScene, target: Path, kind: FileKind, config: ExportConfig, overwrite: bool
-) -> tuple[ExportReport, ShownSplats]:
+) -> tuple[ExportReport, SplatsWithBackground]:
     """Write splats to a file or a page; return the report without scores, and the splats as read back."""
     loaded = baked.source
-    shown: ShownSplats
+    decoded: SplatsWithBackground
     if isinstance(kind, SplatFormat):
         camera = loaded.cameras[0][1] if loaded.cameras else None
         data = kind.encode(baked.splats, Hints(loaded.up, camera, config.spz_version))
-        shown = kind.decode(data, str(target)), None
+        decoded = kind.decode(data, str(target)), None
     else:
         title = target.stem if config.title is None else config.title
         data = encode_baked_page(loaded, baked.splats, baked.picture, title, config.credit)
-        shown = decode_splats_page(data, str(target))
-    written = write_atomic(target, data, overwrite=overwrite)
-    return _describe_splats(baked, written, len(data)), shown
+        decoded = decode_splats_page(data, str(target))
+    written_path = write_atomic(target, data, overwrite=overwrite)
+    return _describe_splats(baked, written_path, len(data)), decoded
 
 
-def _describe_splats(baked: BakedScene, written: Path, size: int) -> ExportReport:
+def _describe_splats(baked: BakedScene, written_path: Path, size: int) -> ExportReport:
     """Return the report on a file or folder of splats without scores."""
     return ExportReport(
-        str(written),
+        str(written_path),
         size,
         len(baked.splats),
         background=baked.background_count,

@@ -9,8 +9,8 @@ import numpy as np
 
 from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.scene import Camera
-from hyrfpack.splats.formats.gltf import GLTF_UP, linear_colors
-from hyrfpack.splats.placement import local_origin, local_positions, upright_rotation
+from hyrfpack.splats.formats.gltf import GLTF_UP, encode_linear_colors
+from hyrfpack.splats.placement import choose_local_origin, subtract_origin, upright_rotation
 from hyrfpack.splats.splats import Splats
 
 _CAMERA_COLOR = (255, 106, 0, 255)  # orange, because it is rare in photos
@@ -42,7 +42,7 @@ def encode_points(splats: Splats, cameras: Sequence[Camera], extension: Literal[
     if not len(splats) and not cameras:
         raise HyrfDataError("there are neither points nor cameras to export", fix="name a model that has some")
     frusta = _make_frusta(cameras, splats.positions)
-    origin = local_origin(np.concatenate((splats.positions, frusta.reshape(-1, 3))))
+    origin = choose_local_origin(np.concatenate((splats.positions, frusta.reshape(-1, 3))))
     return _encode_glb(splats, frusta, origin, up) if extension == "glb" else _encode_ply(splats, frusta, origin)
 
 
@@ -51,12 +51,12 @@ def _encode_glb(splats: Splats, frusta: np.ndarray, origin: np.ndarray, up: np.n
         import trimesh
         from trimesh.path.entities import Line
 
-    scene, place = trimesh.Scene(), np.eye(4)
-    place[:3, :3] = upright_rotation(up, np.array(GLTF_UP))
-    place[:3, 3] = place[:3, :3] @ origin
+    scene, node_transform = trimesh.Scene(), np.eye(4)
+    node_transform[:3, :3] = upright_rotation(up, np.array(GLTF_UP))
+    node_transform[:3, 3] = node_transform[:3, :3] @ origin
     if len(splats):
-        cloud = trimesh.PointCloud(local_positions(splats, origin), colors=linear_colors(splats))
-        scene.add_geometry(cloud, node_name="gaussians", geom_name="gaussians", transform=place)
+        cloud = trimesh.PointCloud(subtract_origin(splats, origin), colors=encode_linear_colors(splats))
+        scene.add_geometry(cloud, node_name="gaussians", geom_name="gaussians", transform=node_transform)
     if len(frusta):
         strokes = np.arange(len(frusta))[:, None] * frusta.shape[1] + _FRUSTUM_STROKE
         lines = trimesh.path.Path3D(
@@ -65,7 +65,7 @@ def _encode_glb(splats: Splats, frusta: np.ndarray, origin: np.ndarray, up: np.n
             colors=np.tile(np.array(_CAMERA_COLOR, np.uint8), (len(frusta), 1)),
             process=False,
         )
-        scene.add_geometry(lines, node_name="cameras", geom_name="cameras", transform=place)
+        scene.add_geometry(lines, node_name="cameras", geom_name="cameras", transform=node_transform)
     return scene.export(file_type="glb")
 
 

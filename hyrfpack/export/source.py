@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,7 +39,7 @@ class Source:
 
     Attributes:
         model: the model; the scene of a merged file, its first part.
-        drawn: what is shown and exported: `model`, or all parts of a merged file.
+        all_parts: what is shown and exported: `model`, or the merged model of all parts of a merged file.
         cameras: names and cameras of the training photos; empty if the file keeps none and no photos are given. Files
             keep no names, so without photos these are "camera-0000.png" and so on.
         fit_cameras: cameras at which colours are fitted; generated ones around the scene if none are known.
@@ -52,7 +53,7 @@ class Source:
     """
 
     model: HybridModel
-    drawn: HybridModel | MergedModel
+    all_parts: HybridModel | MergedModel
     cameras: list[tuple[str, Camera]]
     fit_cameras: list[Camera]
     measured_views: list[tuple[Camera, View | None]]
@@ -73,57 +74,84 @@ class Source:
         capture = Capture(facts, data)
         if mismatch := capture.mismatch:
             raise HyrfDataError(mismatch, fix=MISMATCH_REMEDY)
-        drawn = load_model_or_parts(path)
-        model = scene_of(drawn)
-        if not len(drawn):
+        all_parts = load_model_or_parts(path)
+        model = scene_of(all_parts)
+        if not len(all_parts):
             raise HyrfError(f"{path}: there is no Gaussian in it, so there is nothing to export", fix="train it again")
         try:
             viewpoint = capture.viewpoint
         except HyrfDataError as error:  # photos would not help, because the model's own viewpoint is needed
-            why = error.__cause__
+            reason = error.__cause__
             raise HyrfDataError(
-                f"{path}: its viewpoint cannot be used ({why!s:.160})",
+                f"{path}: its viewpoint cannot be used ({reason!s:.160})",
                 fix="train the model again",
-            ) from why
+            ) from reason
         up, center = viewpoint.up / math.hypot(*viewpoint.up), viewpoint.center
-        stated = provenance_mse(facts["provenance"])
-        cameras = capture.cameras
-        measured_views: list[tuple[Camera, View | None]]
         if data is not None and data.train:
-            named = [(view.name, view.camera) for view in data.train]
-            measured_views = [(view.camera, view) for view in evenly_spaced(data.test, MAX_MEASURED_VIEWS)]
-            fit_cameras = evenly_spaced(cameras, MAX_FIT_CAMERAS)
-            return cls(model, drawn, named, fit_cameras, measured_views, _choose_up(cameras, up), center, stated)
-        if capture.is_synthetic:
-            # The orbit has twice as many cameras as RING_CAMERAS; every other one lies between the fitted ones.
-            between = evenly_spaced(cameras[1::2], MAX_MEASURED_VIEWS)
-            measured_views = [(camera, None) for camera in between]
-            return cls(model, drawn, [], _make_ring_cameras(viewpoint, center, up), measured_views, up, center, stated)
-        named = [(f"camera-{number:04d}.png", camera) for number, camera in enumerate(cameras)]
-        spare = fit_cameras = cameras
-        holds_out = len(cameras) >= (MIN_COARSE_CAMERAS_TO_HOLD_OUT if capture.is_coarse else MIN_CAMERAS_TO_HOLD_OUT)
-        if holds_out:
-            spare = cameras[::HELD_OUT_INTERVAL]
-            fit_cameras = [camera for number, camera in enumerate(cameras) if number % HELD_OUT_INTERVAL]
-        measured_views = [(camera, None) for camera in evenly_spaced(spare, MAX_MEASURED_VIEWS)]
-        if capture.is_coarse:
-            # Coarse cameras are too few to fit harmonics, so cameras between them and around the scene are added.
-            between = [
-                camera for seed in range(VIEWS_BETWEEN_PER_CAMERA) for camera in interpolate_views(fit_cameras, seed)
-            ]
-            fit_cameras = [*fit_cameras, *between, *_make_ring_cameras(viewpoint, center, up)]
+            chosen = _choose_photo_cameras(capture, data)
+        elif capture.is_synthetic:
+            chosen = _choose_orbit_cameras(capture, viewpoint, center, up)
+        else:
+            chosen = _choose_stored_cameras(capture, viewpoint, center, up)
         return cls(
-            model,
-            drawn,
-            named,
-            fit_cameras,
-            measured_views,
-            _choose_up(cameras, up),
-            center,
-            stated,
+            model=model,
+            all_parts=all_parts,
+            cameras=chosen.named,
+            fit_cameras=chosen.fit,
+            measured_views=chosen.measured,
+            up=up if capture.is_synthetic else _choose_up(capture.cameras, up),
+            center=center,
+            photo_mse=provenance_mse(facts["provenance"]),
             has_coarse_cameras=capture.is_coarse,
-            fits_measured_views=not holds_out,
+            fits_measured_views=chosen.fits_measured,
         )
+
+
+class _ChosenCameras(NamedTuple):
+    """The cameras of a `Source`: its `cameras`, `fit_cameras`, `measured_views` and `fits_measured_views`."""
+
+    named: list[tuple[str, Camera]]
+    fit: list[Camera]
+    measured: list[tuple[Camera, View | None]]
+    fits_measured: bool = False
+
+
+def _choose_photo_cameras(capture: Capture, data: Scene) -> _ChosenCameras:
+    """Choose the cameras of the photos: training photos to fit colours, held-out photos to measure the loss."""
+    return _ChosenCameras(
+        [(view.name, view.camera) for view in data.train],
+        evenly_spaced(capture.cameras, MAX_FIT_CAMERAS),
+        [(view.camera, view) for view in evenly_spaced(data.test, MAX_MEASURED_VIEWS)],
+    )
+
+
+def _choose_orbit_cameras(capture: Capture, viewpoint: Viewpoint, center: np.ndarray, up: np.ndarray) -> _ChosenCameras:
+    """Choose generated cameras around a scene whose file keeps none."""
+    # The orbit has twice as many cameras as RING_CAMERAS; every other one lies between the fitted ones.
+    between = evenly_spaced(capture.cameras[1::2], MAX_MEASURED_VIEWS)
+    return _ChosenCameras([], _make_ring_cameras(viewpoint, center, up), [(camera, None) for camera in between])
+
+
+def _choose_stored_cameras(
+    capture: Capture, viewpoint: Viewpoint, center: np.ndarray, up: np.ndarray
+) -> _ChosenCameras:
+    """Choose among the cameras that a file keeps; every HELD_OUT_INTERVAL-th is not fitted if there are enough."""
+    cameras = capture.cameras
+    measured = fit = cameras
+    holds_out = len(cameras) >= (MIN_COARSE_CAMERAS_TO_HOLD_OUT if capture.is_coarse else MIN_CAMERAS_TO_HOLD_OUT)
+    if holds_out:
+        measured = cameras[::HELD_OUT_INTERVAL]
+        fit = [camera for number, camera in enumerate(cameras) if number % HELD_OUT_INTERVAL]
+    if capture.is_coarse:
+        # Coarse cameras are too few to fit harmonics, so cameras between them and around the scene are added.
+        between = [camera for seed in range(VIEWS_BETWEEN_PER_CAMERA) for camera in interpolate_views(fit, seed)]
+        fit = [*fit, *between, *_make_ring_cameras(viewpoint, center, up)]
+    return _ChosenCameras(
+        [(f"camera-{number:04d}.png", camera) for number, camera in enumerate(cameras)],
+        fit,
+        [(camera, None) for camera in evenly_spaced(measured, MAX_MEASURED_VIEWS)],
+        fits_measured=not holds_out,
+    )
 
 
 def _choose_up(cameras: list[Camera], up: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from hyrfpack.export.baked_scene import ShownSplats
+from hyrfpack.export.baked_scene import SplatsWithBackground
 from hyrfpack.export.boxes import Box, BoxTree
 from hyrfpack.export.kinds import STREAMED_SOG_FOLDER
 from hyrfpack.export.levels import BakedLevels
@@ -42,17 +42,17 @@ class _Leaf:
     """What the index says about a chunk.
 
     Attributes:
-        runs: by level, the number of the file, the first Gaussian in it and the number of Gaussians.
+        ranges: by level, the number of the file, the first Gaussian in it and the number of Gaussians.
         boxes: boxes of the Gaussians of each level, as read back from its file.
     """
 
-    runs: dict[int, tuple[int, int, int]] = field(default_factory=dict)
+    ranges: dict[int, tuple[int, int, int]] = field(default_factory=dict)
     boxes: list[Box] = field(default_factory=list)
 
 
 def write_streamed_sog(
     baked: BakedLevels, target: Path, overwrite: bool, progress: Progress
-) -> tuple[int, ShownSplats]:
+) -> tuple[int, SplatsWithBackground]:
     """Write the levels of a scene as Streamed SOG.
 
     Args:
@@ -71,21 +71,22 @@ def write_streamed_sog(
     level_count = max(len(chunk.levels) for chunk in baked.chunks)
     files = [(level, group) for level in range(level_count) for group in _group_chunks(baked, order, level)]
     leaves = [_Leaf() for _ in baked.chunks]
-    names, shown, counts = [], [], [0] * level_count
+    names, finest_parts, counts = [], [], [0] * level_count
     with IndexedFolder(target, INDEX_NAME, overwrite) as folder:
         for number, (level, group) in enumerate(files):
             progress(TaskEvent(f"writing file {number + 1}/{len(files)}", number / len(files)))
-            name = f"{level}_{sum(1 for other, _ in files[:number] if other == level)}"
-            runs = [len(baked.chunks[chunk].levels[level]) for chunk in group]
-            splats = _write_sog(folder, name, concatenate([baked.chunks[chunk].levels[level] for chunk in group]), runs)
+            name = f"{level}_{sum(1 for file_level, _ in files[:number] if file_level == level)}"
+            parts = [baked.chunks[chunk].levels[level] for chunk in group]
+            group_sizes = [len(part) for part in parts]
+            splats = _write_sog(folder, name, concatenate(parts), group_sizes)
             names.append(f"{name}/{sog.META_NAME}")
             counts[level] += len(splats)
-            shown += [splats] if level == 0 else []
-            for chunk, start, count in zip(group, accumulate(runs, initial=0), runs, strict=False):
-                leaves[chunk].runs[level] = (number, start, count)
+            finest_parts += [splats] if level == 0 else []
+            for chunk, start, count in zip(group, accumulate(group_sizes, initial=0), group_sizes, strict=False):
+                leaves[chunk].ranges[level] = (number, start, count)
                 leaves[chunk].boxes.append(Box.of_splats(splats[start : start + count]))
         if baked.background is not None:
-            shown.append(_write_sog(folder, ENVIRONMENT_NAME, baked.background, ()))
+            finest_parts.append(_write_sog(folder, ENVIRONMENT_NAME, baked.background, ()))
         index = {
             "version": FORMAT_VERSION,
             "asset": {"generator": writer_name()},
@@ -98,10 +99,10 @@ def write_streamed_sog(
             "tree": _make_tree(baked, leaves, level_count),
         }
         folder.write(INDEX_NAME, json.dumps(index, separators=(",", ":"), allow_nan=False).encode("ascii"))
-    return folder.bytes, (concatenate(shown), None)
+    return folder.bytes, (concatenate(finest_parts), None)
 
 
-def level_errors(chunk: Chunk, level_count: int) -> list[float]:
+def compute_level_errors(chunk: Chunk, level_count: int) -> list[float]:
     """Return an error for each level: the mean of the chunk's `errors` over all radii, raised so that none falls.
 
     These are mean squared errors of a pixel that shows the chunk. A program that spends its budget by the error that a
@@ -129,30 +130,30 @@ def _group_chunks(baked: BakedLevels, order: Sequence[int], level: int) -> Itera
         yield group
 
 
-def _write_sog(folder: IndexedFolder, name: str, splats: Splats, runs: Sequence[int]) -> Splats:
+def _write_sog(folder: IndexedFolder, name: str, splats: Splats, group_sizes: Sequence[int]) -> Splats:
     """Write an unbundled SOG, its meta.json last, and return its splats as read back."""
-    files = sog.encode_files(splats, runs)
+    files = sog.encode_files(splats, group_sizes)
     for file in (*(file for file in files if file != sog.META_NAME), sog.META_NAME):
         folder.write(f"{name}/{file}", files[file])
     return sog.decode_files(files, str(folder.path / name))
 
 
 def _make_tree(baked: BakedLevels, leaves: Sequence[_Leaf], level_count: int) -> dict[str, Any]:
-    """Return the tree of the index."""
+    """Return the tree of boxes as the index describes it, with the ranges of Gaussians and the errors of each leaf."""
     chunks = baked.scene.manifest.chunks
 
     def describe(node: BoxTree) -> dict[str, Any]:
-        bound = {"min": _rounded(node.box.low), "max": _rounded(node.box.high)}
+        bound = {"min": _round_digits(node.box.low), "max": _round_digits(node.box.high)}
         if node.leaf is None:
             return {"bound": bound, "children": [describe(child) for child in node.children]}
-        runs = sorted(leaves[node.leaf].runs.items())
-        lods = {str(level): {"file": file, "offset": start, "count": count} for level, (file, start, count) in runs}
-        errors = level_errors(chunks[baked.chunks[node.leaf].number], level_count)
-        return {"bound": bound, "lods": lods, "errors": _rounded(errors)}
+        ranges = sorted(leaves[node.leaf].ranges.items())
+        lods = {str(level): {"file": file, "offset": start, "count": count} for level, (file, start, count) in ranges}
+        errors = compute_level_errors(chunks[baked.chunks[node.leaf].number], level_count)
+        return {"bound": bound, "lods": lods, "errors": _round_digits(errors)}
 
     return describe(BoxTree.build([Box.around(leaf.boxes) for leaf in leaves]))
 
 
-def _rounded(values: Sequence[float] | np.ndarray) -> list[float]:
+def _round_digits(values: Sequence[float] | np.ndarray) -> list[float]:
     """Round to the 7 digits that the format asks for."""
     return [float(f"{value:.7g}") for value in values]

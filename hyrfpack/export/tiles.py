@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from hyrfpack.export.baked_scene import ShownSplats
+from hyrfpack.export.baked_scene import SplatsWithBackground
 from hyrfpack.export.boxes import Box, BoxTree
 from hyrfpack.export.kinds import SPZ_TILES_FOLDER, TILES_FOLDER
 from hyrfpack.export.levels import BakedChunk, BakedLevels
@@ -40,7 +40,7 @@ from hyrfpack.format.scene_manifest import Chunk, Manifest
 from hyrfpack.outputs.indexed_folder import IndexedFolder
 from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.splats.formats import gltf
-from hyrfpack.splats.placement import local_origin, upright_rotation
+from hyrfpack.splats.placement import choose_local_origin, upright_rotation
 from hyrfpack.splats.splats import Splats, concatenate
 from hyrfpack.splats.table import FileKind
 
@@ -59,7 +59,7 @@ MAX_ERROR_DISC_RADIUS_PIXELS = 4.0
 
 def write_tiles(
     kind: FileKind, baked: BakedLevels, target: Path, overwrite: bool, progress: Progress
-) -> tuple[int, ShownSplats]:
+) -> tuple[int, SplatsWithBackground]:
     """Write the levels of a scene as 3D Tiles.
 
     Args:
@@ -77,25 +77,25 @@ def write_tiles(
     """
     compressed = kind is SPZ_TILES_FOLDER
     loaded, manifest = baked.finest.source, baked.scene.manifest
-    origin = local_origin(baked.finest.splats.positions)
+    origin = choose_local_origin(baked.finest.splats.positions)
     with IndexedFolder(target, INDEX_NAME, overwrite) as folder:
         contents = _ContentWriter(folder, origin, compressed)
-        chunks, shown = [], []
-        for place, chunk in enumerate(baked.chunks):
-            progress(TaskEvent(f"writing chunk {place + 1}/{len(baked.chunks)}", place / len(baked.chunks)))
+        chunks, finest_parts = [], []
+        for number, chunk in enumerate(baked.chunks):
+            progress(TaskEvent(f"writing chunk {number + 1}/{len(baked.chunks)}", number / len(baked.chunks)))
             tile, finest = _write_chunk(contents, chunk, manifest)
             chunks.append(tile)
-            shown.append(finest)
-        boxes = [_box_of(tile) for tile in chunks]
+            finest_parts.append(finest)
+        boxes = [_read_box(tile) for tile in chunks]
         root = _make_tree(BoxTree.build(boxes), chunks)
         if baked.background is not None:
             # All contents have the same degree, because a client may draw them together.
             background = baked.background.with_degree(baked.finest.degree)
             root, splats = _add_background(contents, root, background)
-            shown.append(splats)
-        turn = upright_rotation(loaded.up, np.array(TILES_UP))
+            finest_parts.append(splats)
+        upright = upright_rotation(loaded.up, np.array(TILES_UP))
         matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = turn @ CONTENT_TURN.T, turn @ origin
+        matrix[:3, :3], matrix[:3, 3] = upright @ CONTENT_TURN.T, upright @ origin
         root["transform"] = matrix.T.ravel().tolist()  # column by column
         used = [gltf.SPLATTING_EXTENSION, *([gltf.SPZ_EXTENSION] if compressed else [])]
         content_extensions = {"extensionsUsed": used, **({"extensionsRequired": used} if compressed else {})}
@@ -107,10 +107,10 @@ def write_tiles(
             "root": root,
         }
         folder.write(INDEX_NAME, json.dumps(tileset, separators=(",", ":"), allow_nan=False).encode("ascii"))
-    return folder.bytes, (concatenate(shown), None)
+    return folder.bytes, (concatenate(finest_parts), None)
 
 
-def geometric_errors(chunk: Chunk, radii: Sequence[float]) -> list[float]:
+def compute_geometric_errors(chunk: Chunk, radii: Sequence[float]) -> list[float]:
     """Return the geometric error of each level of a chunk, in world units.
 
     A client draws a tile with the geometric error g as long as g f / d <= MAX_SCREEN_SPACE_ERROR_PIXELS, with the focal
@@ -121,11 +121,11 @@ def geometric_errors(chunk: Chunk, radii: Sequence[float]) -> list[float]:
 
     for the smallest such R. Errors never fall from a level to a coarser one; the finest one has none.
     """
-    limits = [_projected_radius_limit(level.errors, radii) for level in chunk.levels[1:]]
+    limits = [_find_radius_limit(level.errors, radii) for level in chunk.levels[1:]]
     return list(accumulate([0.0, *(MAX_SCREEN_SPACE_ERROR_PIXELS * chunk.radius / limit for limit in limits)], max))
 
 
-def _projected_radius_limit(errors: Sequence[float], radii: Sequence[float]) -> float:
+def _find_radius_limit(errors: Sequence[float], radii: Sequence[float]) -> float:
     """Return the smallest R with R sqrt(error(R)) = MAX_ERROR_DISC_RADIUS_PIXELS; infinite if there is none.
 
     Args:
@@ -157,31 +157,31 @@ class _ContentWriter:
     def write(self, name: str, splats: Splats) -> tuple[dict[str, Any], Splats, Box]:
         """Write splats, and return the content of a tile, the splats as read back and their box in the tile's axes."""
         uri = f"{CONTENT_FOLDER}/{name}.glb"
-        near = replace(splats, positions=splats.positions - self.origin)
+        relative = replace(splats, positions=splats.positions - self.origin)
         if self.compressed:
-            data, shown = gltf.encode_compressed(near)
+            data, decoded = gltf.encode_compressed(relative)
         else:
-            data = gltf.encode_at(near, np.zeros(3), HALF_TURN)
-            shown = gltf.decode(data, uri)
+            data = gltf.encode_at(relative, np.zeros(3), HALF_TURN)
+            decoded = gltf.decode(data, uri)
         self.folder.write(uri, data)
-        box = Box.of_splats(shown, CONTENT_TURN)
-        return {"uri": uri}, replace(shown, positions=shown.positions + self.origin), box
+        box = Box.of_splats(decoded, CONTENT_TURN)
+        return {"uri": uri}, replace(decoded, positions=decoded.positions + self.origin), box
 
 
 def _write_chunk(contents: _ContentWriter, chunk: BakedChunk, manifest: Manifest) -> tuple[dict[str, Any], Splats]:
     """Write the levels of a chunk, and return its coarsest tile, with finer ones below it, and its finest splats."""
     described = manifest.chunks[chunk.number]
-    errors = geometric_errors(described, manifest.error_radii)
+    errors = compute_geometric_errors(described, manifest.error_radii)
     tile: dict[str, Any] = {}
     for level, splats in enumerate(chunk.levels):
         if not len(splats):
             continue
-        content, shown, box = contents.write(f"{chunk.number:04d}-{level}", splats)
+        content, decoded, box = contents.write(f"{chunk.number:04d}-{level}", splats)
         if level == 0:
-            finest = shown
-        below = {"children": [tile]} if tile else {}
-        holding = Box.around([box, _box_of(tile)]) if tile else box
-        tile = {**_make_tile(holding, errors[level]), "content": content, **below}
+            finest = decoded
+        children = {"children": [tile]} if tile else {}
+        bounds = Box.around([box, _read_box(tile)]) if tile else box
+        tile = {**_make_tile(bounds, errors[level]), "content": content, **children}
     return {**tile, "refine": "REPLACE"}, finest  # tiles below inherit it
 
 
@@ -191,8 +191,8 @@ def _make_tree(node: BoxTree, chunks: Sequence[dict[str, Any]]) -> dict[str, Any
     A tile without content shows nothing, so it has to be refined as soon as it is seen as more than a dot: its
     geometric error is its diagonal.
     """
-    below = [node] if node.leaf is not None else node.children
-    children = [_make_tree(child, chunks) if child.leaf is None else chunks[child.leaf] for child in below]
+    nodes = [node] if node.leaf is not None else node.children
+    children = [_make_tree(child, chunks) if child.leaf is None else chunks[child.leaf] for child in nodes]
     error = max(node.box.diagonal, *(child["geometricError"] for child in children))
     return {**_make_tile(node.box, error), "refine": "ADD", "children": children}
 
@@ -201,10 +201,10 @@ def _add_background(
     contents: _ContentWriter, root: dict[str, Any], background: Splats
 ) -> tuple[dict[str, Any], Splats]:
     """Write the background as the content of the root; return the root with a larger box, and the splats."""
-    content, shown, box = contents.write("background", background)
-    holding = Box.around([box, _box_of(root)])
-    error = max(holding.diagonal, root["geometricError"])
-    return {**root, **_make_tile(holding, error), "content": content}, shown
+    content, decoded, box = contents.write("background", background)
+    bounds = Box.around([box, _read_box(root)])
+    error = max(bounds.diagonal, root["geometricError"])
+    return {**root, **_make_tile(bounds, error), "content": content}, decoded
 
 
 def _make_tile(box: Box, error: float) -> dict[str, Any]:
@@ -212,7 +212,7 @@ def _make_tile(box: Box, error: float) -> dict[str, Any]:
     return {"boundingVolume": {"box": [*box.center.tolist(), *sides]}, "geometricError": error}
 
 
-def _box_of(tile: dict[str, Any]) -> Box:
+def _read_box(tile: dict[str, Any]) -> Box:
     values = np.array(tile["boundingVolume"]["box"])
     half = values[[3, 7, 11]]
     return Box(values[:3] - half, values[:3] + half)

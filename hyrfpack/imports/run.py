@@ -31,7 +31,7 @@ from hyrfpack.outputs import Outputs, StrPath
 from hyrfpack.progress import TaskEvent, part_of_progress
 from hyrfpack.scene import Camera, Scene
 from hyrfpack.splats.files import bytes_on_disk, read_splats
-from hyrfpack.splats.names import sog_folder
+from hyrfpack.splats.names import find_sog_folder
 from hyrfpack.splats.splats import Splats
 
 _LOG = logging.getLogger(__name__)
@@ -131,7 +131,7 @@ def check_target(
         scene: photos and poses whose cameras are read.
         overwrite: an existing file may be replaced, except those that are read.
     """
-    folder = None if source is None else sog_folder(source)
+    folder = None if source is None else find_sog_folder(source)
     Outputs(source, cameras, folder=folder, scene=scene, overwrite=overwrite).file(target, ".hyrf")
 
 

@@ -14,12 +14,12 @@ from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.data.folder import list_photos
 from hyrfpack.errors import HyrfDataError, HyrfError, suggest_command
-from hyrfpack.export.folder import check_folder
+from hyrfpack.export.folder import check_export_folder
 from hyrfpack.export.kinds import (
     EXPORT_ENDINGS,
     PLAYER_FOLDER,
     TRANSFORMS_JSON,
-    check_place,
+    check_export_target,
     check_request,
     find_file_kind,
 )
@@ -212,10 +212,10 @@ class Request:
         elif self.is_output_folder:
             model = self.source.path if self.source.kind == "model" else self.work / PACKED_MODEL
             # This check comes first, because the next one would take the poster of an existing player for a photo.
-            check_folder(self.output, [model], [self.source.scene], overwrite=overwrite, is_gallery=False)
+            check_export_folder(self.output, [model], [self.source.scene], overwrite=overwrite, is_gallery=False)
             outputs.folder(self.output, [])
         else:
-            check_place(self.output, outputs)
+            check_export_target(self.output, outputs)
 
     @property
     def _is_model(self) -> bool:

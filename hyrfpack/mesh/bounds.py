@@ -111,8 +111,8 @@ def _format_sides(sides: np.ndarray) -> str:
 def choose_default_box(points: np.ndarray, center: np.ndarray, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners (3,) of the box around what cameras at `positions` (N, 3) see near the centre."""
     reach = np.median(np.linalg.norm(positions - center, axis=1))
-    near = np.linalg.norm(points - center, axis=1) <= reach
-    chosen = points[near] if near.mean() >= MIN_INNER_SHARE else points
+    is_near = np.linalg.norm(points - center, axis=1) <= reach
+    chosen = points[is_near] if is_near.mean() >= MIN_INNER_SHARE else points
     low, high = np.quantile(chosen, BOX_QUANTILES, axis=0)
     return low, high
 

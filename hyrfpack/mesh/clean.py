@@ -35,8 +35,8 @@ def remove_small_components(
 
 def drop_unused_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Remove vertices that no triangle has."""
-    used, place = np.unique(faces, return_inverse=True)
-    return vertices[used], place.reshape(-1, 3)
+    used, new_index = np.unique(faces, return_inverse=True)
+    return vertices[used], new_index.reshape(-1, 3)
 
 
 def reduce_faces(vertices: np.ndarray, faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -71,10 +71,10 @@ def render_depth_maps(
     black = torch.zeros(3)
     for camera in cameras:
         small = shrink_camera(camera, MAX_MAP_SIDE_PIXELS)
-        seen = render_view(model, small, settings, decoded=decoded, solid=black, background=False)
-        depth = render_median_depth(model, small, decoded, seen.indices[seen.visible], settings).numpy()
-        alpha = seen.alpha.numpy()
-        colors = seen.rgb.numpy() / np.maximum(alpha, 0.5)[..., None]
+        rendered = render_view(model, small, settings, decoded=decoded, solid=black, background=False)
+        depth = render_median_depth(model, small, decoded, rendered.indices[rendered.visible], settings).numpy()
+        alpha = rendered.alpha.numpy()
+        colors = rendered.rgb.numpy() / np.maximum(alpha, 0.5)[..., None]
         yield make_depth_map(small, depth, alpha, np.round(255 * colors.clip(0, 1)).astype(np.uint8))
 
 
@@ -89,7 +89,7 @@ def make_depth_map(camera: Camera, depth: np.ndarray, alpha: np.ndarray, colors:
     """
     is_whole = minimum_filter(depth > 0, MEDIAN_FILTER_PIXELS, mode="nearest")
     depth = np.where(is_whole, median_filter(depth, MEDIAN_FILTER_PIXELS, mode="nearest"), depth)
-    cosine = _surface_cosines(camera, depth)
+    cosine = _compute_surface_cosines(camera, depth)
     trusted = (depth > 0) & (cosine >= MIN_COSINE)
     weight = np.round(255 * np.where(trusted, alpha * cosine, 0).clip(0, 1)).astype(np.uint8)
     side = 2 * EMPTY_MARGIN_PIXELS + 1
@@ -102,7 +102,7 @@ def make_depth_map(camera: Camera, depth: np.ndarray, alpha: np.ndarray, colors:
     )
 
 
-def _surface_cosines(camera: Camera, depth: np.ndarray) -> np.ndarray:
+def _compute_surface_cosines(camera: Camera, depth: np.ndarray) -> np.ndarray:
     """Return the cosine (H, W) between the rays and the surface's normals; 0 at edges and at the picture's border."""
     height, width = depth.shape
     cosine = np.zeros((height, width))

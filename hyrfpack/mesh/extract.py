@@ -97,13 +97,13 @@ def extract_mesh(
         f"voxels of {grid.voxel:.4g} and a truncation of "
         f"{truncation:.4g} units"
     )
-    done, lock = 0, Lock()
+    fused_count, lock = 0, Lock()
 
     def count_block() -> None:
-        nonlocal done
+        nonlocal fused_count
         with lock:
-            done += 1
-            progress(TaskEvent("fusing depth", 0.5 + 0.35 * done / len(blocks), done, len(blocks)))
+            fused_count += 1
+            progress(TaskEvent("fusing depth", 0.5 + 0.35 * fused_count / len(blocks), fused_count, len(blocks)))
 
     arrays = MapArrays.pack(maps)
     del maps
@@ -128,8 +128,8 @@ def _color_vertices(arrays: MapArrays, vertices: np.ndarray, tolerance: float) -
     """Return the mean colours (V, 3) uint8 of vertices (V, 3) in the maps that see them."""
     sums = np.empty((len(vertices), 4), np.float32)
     run_ranges(lambda first, last: color_points(first, last, vertices, tolerance, *arrays, sums), len(vertices))
-    seen = sums[:, 3] > 0
-    if seen.any() and not seen.all():  # others take the colour of the nearest vertex that has one
-        _, nearest = cKDTree(vertices[seen]).query(vertices[~seen])
-        sums[~seen] = sums[seen][nearest]
+    is_seen = sums[:, 3] > 0
+    if is_seen.any() and not is_seen.all():  # others take the colour of the nearest vertex that has one
+        _, nearest = cKDTree(vertices[is_seen]).query(vertices[~is_seen])
+        sums[~is_seen] = sums[is_seen][nearest]
     return np.round(sums[:, :3] / np.maximum(sums[:, 3:], 1e-30)).astype(np.uint8)

@@ -10,7 +10,7 @@ import numpy as np
 from hyrfpack.errors import HyrfDataError, needs_package
 from hyrfpack.mesh.extract import Mesh
 from hyrfpack.splats.formats.gltf import GLTF_UP, linear_from_srgb
-from hyrfpack.splats.placement import local_origin, upright_rotation
+from hyrfpack.splats.placement import choose_local_origin, upright_rotation
 
 _LOG = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ def encode_mesh(mesh: Mesh, extension: str, up: np.ndarray) -> bytes:
         HyrfDataError: positions are beyond float32.
         HyrfError: trimesh is missing.
     """
-    origin = local_origin(mesh.vertices)
+    origin = choose_local_origin(mesh.vertices)
     with np.errstate(over="ignore"):
         local = (mesh.vertices - origin).astype(np.float32)
     if not np.isfinite(local).all():
@@ -62,17 +62,17 @@ def _encode_glb(mesh: Mesh, local: np.ndarray, origin: np.ndarray, up: np.ndarra
     with needs_package("writing a mesh as .glb"):
         import trimesh
 
-    place = np.eye(4)
-    place[:3, :3] = upright_rotation(up, np.array(GLTF_UP))
-    place[:3, 3] = place[:3, :3] @ origin
+    node_transform = np.eye(4)
+    node_transform[:3, :3] = upright_rotation(up, np.array(GLTF_UP))
+    node_transform[:3, 3] = node_transform[:3, :3] @ origin
     scene = trimesh.Scene()
     if mesh.colors is None:
         shape = trimesh.Trimesh(local, mesh.faces, process=False)
-        scene.add_geometry(shape, node_name="mesh", geom_name="mesh", transform=place)
+        scene.add_geometry(shape, node_name="mesh", geom_name="mesh", transform=node_transform)
         return scene.export(file_type="glb", include_normals=False)
     colors = np.round(255 * linear_from_srgb(mesh.colors / 255)).astype(np.uint8)
     shape = trimesh.Trimesh(local, mesh.faces, vertex_colors=colors, process=False)
-    scene.add_geometry(shape, node_name="mesh", geom_name="mesh", transform=place)
+    scene.add_geometry(shape, node_name="mesh", geom_name="mesh", transform=node_transform)
 
     def make_unlit(tree: dict) -> None:
         pbr = {"metallicFactor": 0.0, "roughnessFactor": 1.0}

@@ -45,18 +45,20 @@ def estimate_depth_noise(maps: Sequence[DepthMap], grid: Grid, limit: float) -> 
     """
     high = grid.low + grid.voxel * np.array(grid.shape)
     differences = [np.zeros(0)]
-    some = [maps[index] for index in np.linspace(0, len(maps) - 1, min(len(maps), NOISE_VIEWS)).astype(int)]
-    for source in some:
+    sampled_maps = [maps[index] for index in np.linspace(0, len(maps) - 1, min(len(maps), NOISE_VIEWS)).astype(int)]
+    for source in sampled_maps:
         points = source.surface_points(max(1, round((source.depth.size / 500) ** 0.5)))
         points = points[((points >= grid.low) & (points <= high)).all(axis=1)]
-        for other in some:
-            if other is not source:
-                u, v, z = other.camera.project(points)
-                seen = (z > 0) & (u >= 0) & (v >= 0) & (u < other.camera.width) & (v < other.camera.height)
-                rows, columns = v[seen].astype(int), u[seen].astype(int)
-                away, weight = np.abs(other.depth[rows, columns] - z[seen]), other.weight[rows, columns] / 255
-                near = (weight > 0) & (away < limit)
-                differences.append(away[near] * weight[near])  # about the distance to the surface's plane
+        for target in sampled_maps:
+            if target is not source:
+                u, v, z = target.camera.project(points)
+                is_in_picture = (z > 0) & (u >= 0) & (v >= 0) & (u < target.camera.width) & (v < target.camera.height)
+                rows, columns = v[is_in_picture].astype(int), u[is_in_picture].astype(int)
+                distances = np.abs(target.depth[rows, columns] - z[is_in_picture])
+                weight = target.weight[rows, columns] / 255
+                is_same_surface = (weight > 0) & (distances < limit)
+                # The weight is about the cosine, so the product is about the distance to the surface's plane.
+                differences.append(distances[is_same_surface] * weight[is_same_surface])
     all_differences = np.concatenate(differences)
     # The difference of two depths has sqrt(2) times the deviation of each.
     return 1.4826 / 2**0.5 * float(np.median(all_differences)) if len(all_differences) else 0.0
@@ -69,37 +71,37 @@ def find_blocks(maps: Sequence[DepthMap], grid: Grid) -> np.ndarray:
         HyrfError: the mesh would not fit into memory.
     """
     shape = -(-np.array(grid.shape, np.int64) // BLOCK_VOXELS)
-    known = np.zeros(0, np.int64)
+    numbers = np.zeros(0, np.int64)
     for depth_map in maps:
         blocks = find_blocks_near((depth_map.surface_points() - grid.low) / (grid.voxel * BLOCK_VOXELS), shape)
-        known = np.union1d(known, np.ravel_multi_index(tuple(blocks.T), shape))
-        needed, there = len(known) * BLOCK_VOXELS**2 * PEAK_BYTES_PER_SURFACE_VOXEL, memory_bytes()
-        if needed > MAX_MEMORY_SHARE * there:
+        numbers = np.union1d(numbers, np.ravel_multi_index(tuple(blocks.T), shape))
+        needed_bytes, machine_bytes = len(numbers) * BLOCK_VOXELS**2 * PEAK_BYTES_PER_SURFACE_VOXEL, memory_bytes()
+        if needed_bytes > MAX_MEMORY_SHARE * machine_bytes:
             raise HyrfError(
-                f"a mesh with voxels of {grid.voxel:g} units would take more than {needed / 1e9:.1f} GB, and this "
-                f"machine has {there / 1e9:.1f} GB",
+                f"a mesh with voxels of {grid.voxel:g} units would take more than {needed_bytes / 1e9:.1f} GB, and "
+                f"this machine has {machine_bytes / 1e9:.1f} GB",
                 fix="use a larger `voxel` or a smaller `crop`",
             )
-    return np.stack(np.unravel_index(known, shape), axis=1)
+    return np.stack(np.unravel_index(numbers, shape), axis=1)
 
 
-def find_blocks_near(places: np.ndarray, shape: np.ndarray) -> np.ndarray:
+def find_blocks_near(points: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """Return the blocks (B, 3) int64 that lie within BLOCK_MARGIN_VOXELS of points, those inside the grid.
 
     Args:
-        places: (N, 3) points in units of a block, from the corner of the grid.
+        points: (N, 3) points in units of a block, from the corner of the grid.
         shape: (3,) number of blocks along each axis.
     """
     margin = BLOCK_MARGIN_VOXELS / BLOCK_VOXELS
-    first, last = (np.floor(places + sign * margin).astype(np.int64) for sign in (-1, 1))
+    first, last = (np.floor(points + sign * margin).astype(np.int64) for sign in (-1, 1))
     is_near = ((last >= 0) & (first < shape)).all(axis=1)
     # Many points lie in few blocks, so points are reduced to their first block and the axes along which they touch two.
     widest = shape + 1
     rows = np.ravel_multi_index(tuple(first[is_near].T + 1), widest) * 8 + (last - first)[is_near] @ (1, 2, 4)
     rows = np.unique(rows)
     corners = np.stack(np.unravel_index(rows // 8, widest), axis=1) - 1
-    found = [corners[rows & axes == axes] + (axes & 1, axes >> 1 & 1, axes >> 2) for axes in range(8)]
-    blocks = np.unique(np.concatenate(found), axis=0)
+    corners_by_axes = [corners[rows & axes == axes] + (axes & 1, axes >> 1 & 1, axes >> 2) for axes in range(8)]
+    blocks = np.unique(np.concatenate(corners_by_axes), axis=0)
     return blocks[((blocks >= 0) & (blocks < shape)).all(axis=1)]
 
 
@@ -150,19 +152,19 @@ def _extract_block(maps: MapArrays, grid: Grid, start: np.ndarray, truncation: f
     nothing = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     size = BLOCK_VOXELS + 1
     low = grid.low + grid.voxel * start
-    views = _views_of_block(maps, low, grid.voxel * BLOCK_VOXELS)
+    views = _find_views_of_block(maps, low, grid.voxel * BLOCK_VOXELS)
     distance, total = np.empty((2, size, size, size), np.float32)
     fuse_block(low, grid.voxel, truncation, views, *maps[:5], distance, total)
-    known = total >= min_weight
-    whole = np.ones((BLOCK_VOXELS,) * 3, bool)  # cells with all eight corners known
+    is_known = total >= min_weight
+    is_cell_known = np.ones((BLOCK_VOXELS,) * 3, bool)  # cells with all eight corners known
     for corner in np.ndindex(2, 2, 2):
-        whole &= known[tuple(slice(at, at + BLOCK_VOXELS) for at in corner)]
+        is_cell_known &= is_known[tuple(slice(at, at + BLOCK_VOXELS) for at in corner)]
     inside = np.minimum(np.array(grid.shape) - start, BLOCK_VOXELS)
-    whole[inside[0] :], whole[:, inside[1] :], whole[:, :, inside[2] :] = False, False, False
-    if not whole.any() or not (distance[known] < 0).any() or not (distance[known] > 0).any():
+    is_cell_known[inside[0] :], is_cell_known[:, inside[1] :], is_cell_known[:, :, inside[2] :] = False, False, False
+    if not is_cell_known.any() or not (distance[is_known] < 0).any() or not (distance[is_known] > 0).any():
         return nothing
     mask = np.zeros(distance.shape, bool)
-    mask[1:, 1:, 1:] = whole  # scikit-image looks up a cell at its last corner
+    mask[1:, 1:, 1:] = is_cell_known  # scikit-image looks up a cell at its last corner
     try:
         vertices, faces, _, _ = marching_cubes(distance, 0.0, mask=mask)
     except RuntimeError:  # no cell of the mask holds a surface
@@ -170,17 +172,17 @@ def _extract_block(maps: MapArrays, grid: Grid, start: np.ndarray, truncation: f
     return vertices.astype(np.float64) + start, faces.astype(np.int64)
 
 
-def _views_of_block(maps: MapArrays, low: np.ndarray, side: float) -> np.ndarray:
+def _find_views_of_block(maps: MapArrays, low: np.ndarray, side: float) -> np.ndarray:
     """Return the indices of the maps whose pictures may show the block with this corner and side."""
     center, radius = low + side / 2, side * 3**0.5 / 2
     x, y, z = (maps.poses[:, :, :3] @ center + maps.poses[:, :, 3]).T
     fx, fy, cx, cy = maps.lenses.T
     width, height, _ = maps.sizes.T
     keep = z > -radius
-    for along, focal, near, far in ((x, fx, cx, width - cx), (y, fy, cy, height - cy)):
+    for coordinate, focal, before_center, after_center in ((x, fx, cx, width - cx), (y, fy, cy, height - cy)):
         # The planes through the camera and the picture's sides.
-        keep &= (focal * along + near * z) / np.hypot(focal, near) > -radius
-        keep &= (far * z - focal * along) / np.hypot(focal, far) > -radius
+        keep &= (focal * coordinate + before_center * z) / np.hypot(focal, before_center) > -radius
+        keep &= (after_center * z - focal * coordinate) / np.hypot(focal, after_center) > -radius
     return np.flatnonzero(keep)
 
 
@@ -188,7 +190,7 @@ def _weld(vertices: np.ndarray, faces: np.ndarray) -> Triangles:
     """Merge vertices that lie at one place, as at the seams of blocks, and drop triangles without area."""
     steps = np.round(vertices * WELD_STEPS_PER_VOXEL).astype(np.int64)
     keys = (steps[:, 0] << 42) | (steps[:, 1] << 21) | steps[:, 2]
-    _, first, place = np.unique(keys, return_index=True, return_inverse=True)
-    faces = place[faces]
-    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    return vertices[first], faces[proper]
+    _, first_index, new_index = np.unique(keys, return_index=True, return_inverse=True)
+    faces = new_index[faces]
+    has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    return vertices[first_index], faces[has_area]

@@ -35,18 +35,18 @@ def make_manifold(vertices: np.ndarray, faces: np.ndarray, gap: float) -> tuple[
 def _cancel_opposite_faces(faces: np.ndarray) -> np.ndarray:
     """Remove pairs of triangles with the same corners that face opposite directions."""
     ordered = np.sort(faces, axis=1)
-    proper = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])
-    faces, ordered = faces[proper], ordered[proper]
+    has_area = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])
+    faces, ordered = faces[has_area], ordered[has_area]
     # A cyclic permutation keeps the direction.
-    turned = np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
-    sign = np.where(turned[:, 1] < turned[:, 2], 1, -1)
+    rotated = np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    sign = np.where(rotated[:, 1] < rotated[:, 2], 1, -1)
     _, group = np.unique(ordered, axis=0, return_inverse=True)
     group = group.ravel()
     excess = np.bincount(group, sign)[group]
     keep = np.ones(len(faces), bool)
     for index in np.flatnonzero(np.bincount(group)[group] > 1):
-        same = np.flatnonzero((group == group[index]) & (sign == np.sign(excess[index])))
-        keep[index] = index in same[: int(abs(excess[index]))]
+        duplicates = np.flatnonzero((group == group[index]) & (sign == np.sign(excess[index])))
+        keep[index] = index in duplicates[: int(abs(excess[index]))]
     return faces[keep]
 
 
@@ -79,12 +79,12 @@ def _pair_around_edge(
     across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     third = vertices[faces.ravel()[halves - halves % 3 + (halves + 2) % 3]] - first
     angles = np.arctan2(third @ np.cross(axis, across), third @ across)
-    waiting = [(int(halves[i]), bool(forward[i])) for i in np.argsort(-angles, kind="stable")]
+    unpaired = [(int(halves[i]), bool(forward[i])) for i in np.argsort(-angles, kind="stable")]
     pairs = []
-    while waiting:
-        at = next(i for i in range(len(waiting)) if waiting[i - 1][1] and not waiting[i][1])
-        pairs.append((waiting[at - 1][0], waiting[at][0]))
-        waiting = [half for i, half in enumerate(waiting) if i not in (at, (at - 1) % len(waiting))]
+    while unpaired:
+        position = next(i for i in range(len(unpaired)) if unpaired[i - 1][1] and not unpaired[i][1])
+        pairs.append((unpaired[position - 1][0], unpaired[position][0]))
+        unpaired = [half for i, half in enumerate(unpaired) if i not in (position, (position - 1) % len(unpaired))]
     return pairs
 
 
@@ -105,7 +105,7 @@ def _split_vertices(
     centers = vertices[faces].mean(axis=1)[half // 3]
     sums = np.stack([np.bincount(fan, axis, fans) for axis in centers.T], axis=1)
     toward = sums / np.bincount(fan)[:, None] - positions
-    positions[is_split] += _shortened(toward[is_split], gap)
+    positions[is_split] += _limit_lengths(toward[is_split], gap)
     return positions, fan.reshape(-1, 3)
 
 
@@ -125,7 +125,7 @@ def _split_shared_edges(
         thirds = [vertices[faces.ravel()[h - h % 3 + (h + 2) % 3]] for h in (half, int(partners[half]))]
         middle = (vertices[starts[half]] + vertices[ends[half]]) / 2
         middles[half] = middles[int(partners[half])] = len(vertices) + len(added)
-        added.append(middle + _shortened((sum(thirds) / 2 - middle)[None], gap)[0])
+        added.append(middle + _limit_lengths((sum(thirds) / 2 - middle)[None], gap)[0])
     if not added:
         return vertices, faces
     parts = [np.delete(faces, np.unique(shared // 3), axis=0)]
@@ -140,6 +140,6 @@ def _split_shared_edges(
     return np.concatenate((vertices, added)), np.concatenate(parts)
 
 
-def _shortened(vectors: np.ndarray, length: float) -> np.ndarray:
+def _limit_lengths(vectors: np.ndarray, length: float) -> np.ndarray:
     """Return vectors (N, 3) of the same directions that are at most `length` long."""
     return vectors * np.minimum(1, length / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300))

@@ -87,13 +87,13 @@ def _fill_solid(vertices: np.ndarray, faces: np.ndarray, voxel: float) -> tuple[
     is_free = np.ones(shape, bool)
     is_free[tuple(np.round((vertices - origin) / voxel).astype(int).T)] = False
     nodes = np.argwhere(distance_transform_edt(is_free) <= WALL_VOXELS + 2)
-    places = origin + voxel * nodes
-    distance, nearest = cKDTree(vertices).query(places, workers=thread_count())
-    above = ((places - vertices[nearest]) * _vertex_normals(vertices, faces)[nearest]).sum(axis=1)
-    beside = np.sqrt(np.maximum(distance**2 - above**2, 0))
-    outside = np.maximum.reduce([above, -above - WALL_VOXELS * voxel, beside - RIM_VOXELS * voxel])
+    node_positions = origin + voxel * nodes
+    distances, nearest = cKDTree(vertices).query(node_positions, workers=thread_count())
+    height = ((node_positions - vertices[nearest]) * _compute_vertex_normals(vertices, faces)[nearest]).sum(axis=1)
+    sideways = np.sqrt(np.maximum(distances**2 - height**2, 0))
+    signed_distances = np.maximum.reduce([height, -height - WALL_VOXELS * voxel, sideways - RIM_VOXELS * voxel])
     field = np.full(shape, WALL_VOXELS * voxel)
-    field[tuple(nodes.T)] = outside
+    field[tuple(nodes.T)] = signed_distances
     solid = field < 0
     widened = distance_transform_edt(~solid) <= GAP_VOXELS
     filled = distance_transform_edt(widened) > GAP_VOXELS
@@ -115,7 +115,7 @@ def _extract_boundary(field: np.ndarray, origin: np.ndarray, voxel: float) -> tu
     return origin + voxel * vertices.astype(np.float64), faces.astype(np.int64)
 
 
-def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _compute_vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Return the unit normals (V, 3) of vertices: the mean of their triangles', weighted by area."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

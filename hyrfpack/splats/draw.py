@@ -119,11 +119,11 @@ def draw_picture(
     *,
     geometry: GeometryConfig = GeometryConfig(),  # noqa: B008 - frozen
 ) -> RenderedPicture:
-    """Render splats as a picture over black, with the geometry that is wanted."""
+    """Render splats as a picture over black, with the depth and the normals that `geometry` asks for."""
     rgb = draw(drawable, camera, settings).rgb
     if not geometry.is_wanted:
         return RenderedPicture(rgb)
     frame, raster_settings = drawable.frame, settings.raster_settings(drawable.antialiased)
     index = frustum_cull(drawable.positions, frame.local_viewport(camera), settings.near, settings.cull_tolerance)
-    seen, has_normals = drawable.gaussians.select(index), geometry.normals is not None
-    return RenderedPicture(rgb, *render_surface(seen, frame, camera, raster_settings, normals=has_normals))
+    visible, has_normals = drawable.gaussians.select(index), geometry.normals is not None
+    return RenderedPicture(rgb, *render_surface(visible, frame, camera, raster_settings, normals=has_normals))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hyrfpack.splats.files import bytes_on_disk
-from hyrfpack.splats.names import sog_folder
+from hyrfpack.splats.names import find_sog_folder
 from hyrfpack.splats.splats import Splats
 
 
@@ -45,7 +45,7 @@ class SplatsFacts:
 
 def describe_splats(path: str | os.PathLike[str], splats: Splats) -> SplatsFacts:
     """Summarise the file at `path`, from which `splats` were read."""
-    is_unbundled = sog_folder(path) is not None
+    is_unbundled = find_sog_folder(path) is not None
     corners = [tuple(map(float, end(axis=0))) for end in (splats.positions.min, splats.positions.max) if len(splats)]
     low, high = corners or (None, None)
     return SplatsFacts(

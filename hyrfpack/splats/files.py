@@ -12,7 +12,7 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import MAX_WORLD_COORDINATE, Camera
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.hints import Hints
-from hyrfpack.splats.names import sog_folder
+from hyrfpack.splats.names import find_sog_folder
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS
 
@@ -92,7 +92,7 @@ def list_source_files(path: str | os.PathLike[str]) -> list[Path]:
         HyrfDataError: the meta.json is damaged.
         OSError: the meta.json of a folder cannot be read.
     """
-    folder = sog_folder(path)
+    folder = find_sog_folder(path)
     if folder is None:
         return [Path(path)]
     meta = folder / sog.META_NAME
@@ -108,20 +108,22 @@ def _read_unbundled_sog(folder: Path) -> dict[str, bytes]:
     """Read the files of an unbundled SOG by name: meta.json and the pictures that it names."""
     names = os.listdir(folder)
     if sog.META_NAME not in names:
-        splats = sorted(name for name in names if name.lower().endswith(READABLE_ENDINGS))
-        splats = [name for name in splats if not name.lower().endswith(".ply") or _holds_gaussians(folder / name)]
-        levels = sorted(name for name in names if (folder / name / sog.META_NAME).is_file())
-        nothing = "name another folder, or use 'hyrfpack make' if it holds photos"
+        splat_names = sorted(name for name in names if name.lower().endswith(READABLE_ENDINGS))
+        splat_names = [name for name in splat_names if (folder / name).is_file() and _may_hold_gaussians(folder / name)]
+        level_names = sorted(name for name in names if (folder / name / sog.META_NAME).is_file())
+        default_fix = "name another folder, or use 'hyrfpack make' if it holds photos"
         raise HyrfDataError(
-            f"{folder}: a folder is read as a loose SOG, {sog.META_NAME} with its pictures, and this one holds "
+            f"{folder}: a folder of splats is an unbundled SOG, {sog.META_NAME} with its pictures, but this one holds "
             f"{_format_names(names)}",
-            fix=f"name {(splats or levels)[0]} in it" if splats or levels else nothing,
+            fix=f"name {(splat_names or level_names)[0]} in it" if splat_names or level_names else default_fix,
         )
     return {file.name: _read_bytes(file) for file in list_source_files(folder)}
 
 
-def _holds_gaussians(file: Path) -> bool:
-    """Return whether the header of a PLY file names properties of Gaussians."""
+def _may_hold_gaussians(file: Path) -> bool:
+    """Return whether a file may hold Gaussians: its header names their properties, or it is no PLY file."""
+    if file.suffix.lower() != ".ply":
+        return True
     with file.open("rb") as stream:
         header = stream.read(MAX_HEADER_BYTES_SEARCHED)
     return b" f_dc_0" in header or b" packed_position" in header
@@ -129,8 +131,8 @@ def _holds_gaussians(file: Path) -> bool:
 
 def _format_names(names: list[str]) -> str:
     """Format the first few names of a folder's files, and the number of the others."""
-    more = f" and {len(names) - MAX_LISTED_NAMES} more" if len(names) > MAX_LISTED_NAMES else ""
-    return (", ".join(sorted(names)[:MAX_LISTED_NAMES]) or "nothing") + more
+    others = f" and {len(names) - MAX_LISTED_NAMES} more" if len(names) > MAX_LISTED_NAMES else ""
+    return (", ".join(sorted(names)[:MAX_LISTED_NAMES]) or "nothing") + others
 
 
 def _read_bytes(path: Path) -> bytes:

@@ -11,7 +11,7 @@ from hyrfpack.ops.harmonics import harmonics_basis, num_sh_bases
 SH_C0 = 0.28209479177387814  # Y00 = 1 / (2 sqrt(pi))
 
 
-def harmonics_rotation(rotation: np.ndarray, degree: int) -> np.ndarray:
+def compute_harmonics_rotation(rotation: np.ndarray, degree: int) -> np.ndarray:
     """Compute the matrix that rotates coefficients of spherical harmonics.
 
     If k are the coefficients of a function f, then M k are those of the rotated function d -> f(R^T d). A rotation maps
@@ -26,11 +26,11 @@ def harmonics_rotation(rotation: np.ndarray, degree: int) -> np.ndarray:
     """
     directions = fibonacci_sphere(64).numpy()  # enough to be well-conditioned for 16 unknowns
     turned = directions @ np.asarray(rotation, np.float64)  # rows R^T d
-    before, after = (harmonics_basis(torch.from_numpy(rows), degree).numpy() for rows in (turned, directions))
+    rotated_basis, basis = (harmonics_basis(torch.from_numpy(rows), degree).numpy() for rows in (turned, directions))
     blocks = np.zeros((num_sh_bases(degree), num_sh_bases(degree)))
     for band in range(degree + 1):
         in_band = slice(band**2, num_sh_bases(band))
-        blocks[in_band, in_band] = np.linalg.lstsq(after[:, in_band], before[:, in_band], rcond=None)[0]
+        blocks[in_band, in_band] = np.linalg.lstsq(basis[:, in_band], rotated_basis[:, in_band], rcond=None)[0]
     return blocks
 
 

@@ -28,7 +28,7 @@ def is_sog_folder(path: Path) -> bool:
     return isinstance(content, dict) and "means" in content
 
 
-def sog_folder(path: str | os.PathLike[str]) -> Path | None:
+def find_sog_folder(path: str | os.PathLike[str]) -> Path | None:
     """Return the folder of an unbundled SOG, given the folder or its meta.json; None for a file."""
     path = Path(path)
     folder = path.parent if path.name == SOG_META_NAME else path

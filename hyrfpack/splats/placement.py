@@ -29,11 +29,11 @@ def upright_rotation(up: np.ndarray, target_up: np.ndarray) -> np.ndarray:
     up, target_up = (np.asarray(vector, np.float64) for vector in (up, target_up))
     if up @ target_up < 0:
         half_turn = np.diag([1.0, -1.0, -1.0])
-        return _shortest_rotation(half_turn @ up, target_up) @ half_turn
-    return _shortest_rotation(up, target_up)
+        return _compute_shortest_rotation(half_turn @ up, target_up) @ half_turn
+    return _compute_shortest_rotation(up, target_up)
 
 
-def local_origin(positions: np.ndarray) -> np.ndarray:
+def choose_local_origin(positions: np.ndarray) -> np.ndarray:
     """Choose the origin (3,) float64 relative to which float32 positions are stored.
 
     It is the world's origin unless the scene is far from there compared to its size. Otherwise it is a point with round
@@ -52,7 +52,7 @@ def local_origin(positions: np.ndarray) -> np.ndarray:
     return np.round(middle / step) * step if step else middle
 
 
-def local_positions(splats: Splats, origin: np.ndarray) -> np.ndarray:
+def subtract_origin(splats: Splats, origin: np.ndarray) -> np.ndarray:
     """Return the positions (N, 3) relative to `origin` as float32.
 
     Raises:
@@ -113,7 +113,7 @@ def decompose_similarity(matrix: np.ndarray, name: str) -> tuple[float, np.ndarr
     )
 
 
-def _shortest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def _compute_shortest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the shortest rotation between unit vectors that are not opposite, by Rodrigues' formula."""
     x, y, z = np.cross(start, end)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -9,7 +9,7 @@ import numpy as np
 
 from hyrfpack.ops.harmonics import MAX_DEGREE, num_sh_bases
 from hyrfpack.rotations import multiply_quats, quaternion_from_matrix
-from hyrfpack.splats.harmonics import SH_C0, harmonics_rotation
+from hyrfpack.splats.harmonics import SH_C0, compute_harmonics_rotation
 
 
 @dataclass(frozen=True)
@@ -91,26 +91,26 @@ class Splats:
             rotation: (3, 3) proper rotation R, which moves a point x to R x.
         """
         turn = quaternion_from_matrix(rotation)
-        quats = normalized_quats(multiply_quats(turn, self.quats.astype(np.float64)))
-        harmonics = np.einsum("jk,nkc->njc", harmonics_rotation(rotation, self.degree), self.harmonics)
+        quats = normalize_quats(multiply_quats(turn, self.quats.astype(np.float64)))
+        harmonics = np.einsum("jk,nkc->njc", compute_harmonics_rotation(rotation, self.degree), self.harmonics)
         return replace(self, positions=self.positions @ np.asarray(rotation).T, quats=quats, harmonics=harmonics)
 
 
 def concatenate(parts: Sequence[Splats]) -> Splats:
     """Join parts into one, in order, at their highest degree; `antialiased` is that of the first part."""
     degree = max(part.degree for part in parts)
-    same = [part.with_degree(degree) for part in parts]
+    padded = [part.with_degree(degree) for part in parts]
     return replace(
-        same[0],
-        positions=np.concatenate([part.positions for part in same]),
-        scales=np.concatenate([part.scales for part in same]),
-        quats=np.concatenate([part.quats for part in same]),
-        opacities=np.concatenate([part.opacities for part in same]),
-        harmonics=np.concatenate([part.harmonics for part in same]),
+        padded[0],
+        positions=np.concatenate([part.positions for part in padded]),
+        scales=np.concatenate([part.scales for part in padded]),
+        quats=np.concatenate([part.quats for part in padded]),
+        opacities=np.concatenate([part.opacities for part in padded]),
+        harmonics=np.concatenate([part.harmonics for part in padded]),
     )
 
 
-def normalized_quats(quats: np.ndarray) -> np.ndarray:
+def normalize_quats(quats: np.ndarray) -> np.ndarray:
     """Normalise quaternions (N, 4) wxyz to unit length and w >= 0, float32; zero quaternions become the identity."""
     quats = np.array(quats, np.float64)
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)

@@ -54,7 +54,7 @@ class SplatFormat(FileKind):
     stores_floats: bool = False
 
 
-def _usd_format(extension: usd.Extension) -> SplatFormat:
+def _make_usd_format(extension: usd.Extension) -> SplatFormat:
     encode, decode = partial(usd.encode, extension=extension), partial(usd.decode, extension=extension)
     return SplatFormat(
         ending=f".{extension}", encode=encode, decode=decode, module=usd.REQUIRED_MODULE, stores_floats=True
@@ -81,7 +81,7 @@ _FORMAT_ROWS = (
         stores_antialiased=True,
     ),
     SplatFormat(ending=".glb", encode=gltf.encode, decode=gltf.decode, stores_floats=True),
-    *map(_usd_format, usd.EXTENSIONS),
+    *map(_make_usd_format, usd.EXTENSIONS),
     SplatFormat(ending=".sog", encode=sog.encode, decode=sog.decode, is_readable=True, stores_antialiased=True),
 )
 FORMATS = {row.ending: row for row in _FORMAT_ROWS}

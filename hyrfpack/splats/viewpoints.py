@@ -80,7 +80,7 @@ class WeightedSplats:
         detail_weights = np.where(is_visible, splats.opacities * (typical / np.maximum(discs, typical)), 0.0)
         areas = np.minimum(areas, np.quantile(areas[is_visible], MAX_AREA_QUANTILE))
         frame = Frame.from_box(
-            *_quantile_box(splats.positions[is_visible], sides[is_visible, 2], detail_weights[is_visible])
+            *_compute_quantile_box(splats.positions[is_visible], sides[is_visible, 2], detail_weights[is_visible])
         )
         boxes_away = np.abs(frame.to_local(splats.positions) / frame.half_extent).max(axis=1)
         return cls(splats, areas, detail_weights, frame, areas / np.maximum(boxes_away, 1) ** 4)
@@ -90,17 +90,19 @@ class WeightedSplats:
         """Half the diagonal of the frame's box, world units."""
         return float(np.linalg.norm(self.frame.half_extent)) * self.frame.scale
 
-    def clutter(self, place: np.ndarray, reach: float = CLEARANCE_RADII) -> float:
+    def estimate_clutter(self, position: np.ndarray, reach: float = CLEARANCE_RADII) -> float:
         """Estimate the share of the sphere around a place (3,) that splats within `reach` radii cover."""
         stride = _choose_stride(len(self.areas))
-        squares = ((self.splats.positions[::stride] - place) ** 2).sum(axis=1)
-        near = squares < (reach * self.radius) ** 2
-        areas, squares = self.areas[::stride][near], squares[near]
+        squares = ((self.splats.positions[::stride] - position) ** 2).sum(axis=1)
+        is_near = squares < (reach * self.radius) ** 2
+        areas, squares = self.areas[::stride][is_near], squares[is_near]
         # A disc with standard deviations a and b and opacity o blocks an area of 2 pi a b o of distant light.
         return stride * float((areas / (2 * squares + areas)).sum())
 
 
-def _quantile_box(positions: np.ndarray, sizes: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _compute_quantile_box(
+    positions: np.ndarray, sizes: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of the box between the weighted FRAME_QUANTILES of each axis.
 
     Each splat counts at both ends of its extent, its position minus and plus its size.
@@ -134,35 +136,36 @@ def sample_viewpoints(
     """
     rng = np.random.default_rng(seed)
     inside = has_enclosed_places(weighted, drawable) if inside is None else inside
-    found: list[Camera] = []
-    others: list[tuple[float, Camera]] = []
+    accepted: list[Camera] = []
+    rejected: list[tuple[float, Camera]] = []
 
-    def covered(camera: Camera) -> float:
-        return -1.0 if weighted.clutter(camera.position) > MAX_CLUTTER else coverage(drawable, camera)
+    def measure_unobstructed_coverage(camera: Camera) -> float:
+        return -1.0 if weighted.estimate_clutter(camera.position) > MAX_CLUTTER else measure_coverage(drawable, camera)
 
     field_of_view = INSIDE_FIELD_OF_VIEW_DEGREES if inside else OUTSIDE_FIELD_OF_VIEW_DEGREES
     for _ in range(CANDIDATES_PER_CAMERA):
-        ends = [
+        lines_of_sight = [
             _sample_inside_view(weighted, rng) if inside else _sample_outside_view(weighted, rng) for _ in range(count)
         ]
-        cameras = [_camera_looking_at(place, target, size, field_of_view) for place, target in ends]
-        for share, camera in zip(parallel_map(covered, cameras, drawable.device), cameras, strict=True):
+        cameras = [_make_camera(position, target, size, field_of_view) for position, target in lines_of_sight]
+        coverages = parallel_map(measure_unobstructed_coverage, cameras, drawable.device)
+        for share, camera in zip(coverages, cameras, strict=True):
             if share >= MIN_COVERAGE:
-                found.append(camera)
+                accepted.append(camera)
             else:
-                others.append((share, camera))
-        if len(found) >= count:
-            return found[:count]
-    others.sort(key=lambda pair: -pair[0])
-    return found + [camera for _, camera in others[: count - len(found)]]
+                rejected.append((share, camera))
+        if len(accepted) >= count:
+            return accepted[:count]
+    rejected.sort(key=lambda pair: -pair[0])
+    return accepted + [camera for _, camera in rejected[: count - len(accepted)]]
 
 
-def coverage(drawable: Drawable, camera: Camera) -> float:
+def measure_coverage(drawable: Drawable, camera: Camera) -> float:
     """Measure the share of a camera's picture that splats cover, 0 to 1, in a small picture of every n-th splat."""
     stride = _choose_stride(len(drawable.positions))
     # All splats, n times as many, would let the n-th power of this transmittance through.
-    seen = draw(drawable[::stride], shrink_camera(camera, THUMBNAIL_SIDE_PIXELS), black=True).transmittance ** stride
-    return 1 - float(seen.mean())
+    picture = draw(drawable[::stride], shrink_camera(camera, THUMBNAIL_SIDE_PIXELS), black=True)
+    return 1 - float((picture.transmittance**stride).mean())
 
 
 def _choose_stride(count: int) -> int:
@@ -177,17 +180,19 @@ def has_enclosed_places(weighted: WeightedSplats, drawable: Drawable) -> bool:
     MIN_ENCLOSED_COVERAGE of all directions.
     """
     rng = np.random.default_rng(0)
-    places = [_sample_inside_view(weighted, rng)[0] for _ in range(ENCLOSURE_CANDIDATES)]
-    clutter = np.array(parallel_map(lambda place: weighted.clutter(place, ROOM_CLEARANCE_RADII), places))
+    positions = [_sample_inside_view(weighted, rng)[0] for _ in range(ENCLOSURE_CANDIDATES)]
+    clutter = np.array(
+        parallel_map(lambda position: weighted.estimate_clutter(position, ROOM_CLEARANCE_RADII), positions)
+    )
     coverages = []
     for index in np.argsort(clutter, kind="stable")[:MAX_ENCLOSURE_TESTS]:
         if clutter[index] <= MAX_CLUTTER:
             axes = np.concatenate((np.eye(3), -np.eye(3)))
             cameras = [
-                _camera_looking_at(places[index], places[index] + axis * weighted.radius, THUMBNAIL_SIDE_PIXELS, 90.0)
+                _make_camera(positions[index], positions[index] + axis * weighted.radius, THUMBNAIL_SIDE_PIXELS, 90.0)
                 for axis in axes
             ]
-            shares = parallel_map(lambda camera: coverage(drawable, camera), cameras, drawable.device)
+            shares = parallel_map(lambda camera: measure_coverage(drawable, camera), cameras, drawable.device)
             coverages.append(np.mean(shares))
     return len(coverages) > 0 and float(np.median(coverages)) >= MIN_ENCLOSED_COVERAGE
 
@@ -195,18 +200,19 @@ def has_enclosed_places(weighted: WeightedSplats, drawable: Drawable) -> bool:
 def _sample_inside_view(weighted: WeightedSplats, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Sample a place in the middle of the box, and the position of the splat that a camera there looks at."""
     frame = weighted.frame
-    place = (
+    position = (
         np.array(frame.center)
         + rng.uniform(-INSIDE_REGION_RATIO, INSIDE_REGION_RATIO, 3) * np.array(frame.half_extent) * frame.scale
     )
-    return place, _sample_position(weighted, weighted.detail_weights, rng)
+    return position, _sample_position(weighted, weighted.detail_weights, rng)
 
 
 def _sample_outside_view(weighted: WeightedSplats, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Sample the position of a splat to look at, and a place at some distance from it; returns place, target."""
     target = _sample_position(weighted, weighted.target_weights, rng)
-    near, far = np.log(OUTSIDE_DISTANCE_RANGE_RADII)
-    return target + weighted.radius * math.exp(rng.uniform(near, far)) * _sample_direction(rng), target
+    log_min_distance, log_max_distance = np.log(OUTSIDE_DISTANCE_RANGE_RADII)
+    distance = weighted.radius * math.exp(rng.uniform(log_min_distance, log_max_distance))
+    return target + distance * _sample_direction(rng), target
 
 
 def _sample_position(weighted: WeightedSplats, weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -222,7 +228,7 @@ def _sample_direction(rng: np.random.Generator) -> np.ndarray:
     return np.array([side * math.cos(angle), height, side * math.sin(angle)])
 
 
-def _camera_looking_at(place: np.ndarray, target: np.ndarray, size: int, degrees: float) -> Camera:
+def _make_camera(position: np.ndarray, target: np.ndarray, size: int, degrees: float) -> Camera:
     focal = size / 2 / math.tan(math.radians(degrees / 2))
-    pose = look_at(place, target, np.array([0.0, -1.0, 0.0]))
+    pose = look_at(position, target, np.array([0.0, -1.0, 0.0]))
     return Camera(size, size, focal, focal, size / 2, size / 2, pose)

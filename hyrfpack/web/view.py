@@ -17,7 +17,7 @@ from hyrfpack.format.scene_folder import SceneFolder, is_scene
 from hyrfpack.format.scene_manifest import MANIFEST_NAME, SceneFile
 from hyrfpack.ply import MAX_HEADER_BYTES
 from hyrfpack.splats.formats.ply_header import check_gaussians
-from hyrfpack.splats.names import SPLATS_SUFFIXES, is_splats, sog_folder
+from hyrfpack.splats.names import SPLATS_SUFFIXES, find_sog_folder, is_splats
 from hyrfpack.web.player import MODEL_SUFFIX, encode_player
 from hyrfpack.web.serve import LOCAL_HOST, MemoryFile, OpenableFile, ServedFiles, serve
 
@@ -103,7 +103,7 @@ def find_playable_file(path: str | os.PathLike[str]) -> Path:
     """
     if not is_splats(path):
         return find_model(path)
-    if sog_folder(path) is not None:
+    if find_sog_folder(path) is not None:
         raise HyrfDataError(
             f"{path}: a page plays single files",
             fix=f"bundle these with {suggest_command('convert', path, 'scene.sog')}",

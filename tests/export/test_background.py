@@ -8,10 +8,10 @@ from scenes import camera_at, ring, small_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.export.background import (
     _accumulate_colors,
-    background_picture,
-    background_splats,
-    cell_centers,
+    compute_cell_centers,
     find_cells,
+    make_background_splats,
+    render_background_picture,
 )
 from hyrfpack.export.bake import bake, compute_visibility
 from hyrfpack.model import BACKGROUND_RADIUS, Frame
@@ -30,7 +30,7 @@ def sky_model(fields: float = 1.0, **options):
 @pytest.mark.parametrize("level", [1, 2, 4])
 def test_cell_centers_and_find_cells_agree_and_cover_the_sphere(level):
     cells = np.arange(6 * 4**level)
-    directions, sides = cell_centers(cells, level)
+    directions, sides = compute_cell_centers(cells, level)
     assert np.array_equal(find_cells(directions, level), cells)
     assert np.allclose(np.linalg.norm(directions, axis=1), 1)
     if level == 4:
@@ -39,7 +39,7 @@ def test_cell_centers_and_find_cells_agree_and_cover_the_sphere(level):
 
 
 def test_a_uniform_background_becomes_a_uniform_nearly_opaque_layer():
-    splats = background_splats(sky_model(0.0), ring(4))
+    splats = make_background_splats(sky_model(0.0), ring(4))
     drawable = Drawable.from_splats(splats, Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0)))
     for camera in ring(3, elevation=-2.0, width=64, height=64):
         drawn = draw(drawable, camera)
@@ -51,7 +51,7 @@ def test_baked_splats_and_background_look_like_the_model():
     frame = Frame((30.0, 10.0, -5.0), 4.0, (1.0, 1.0, 0.5))
     model = sky_model(frame=frame, direction_encoding="sh")
     cameras = [camera_at(4 * c.position + frame.center, frame.center, width=48, height=48) for c in ring(6)]
-    whole = Drawable.from_splats(concatenate((bake(model, cameras)[3], background_splats(model, cameras))), frame)
+    whole = Drawable.from_splats(concatenate((bake(model, cameras)[3], make_background_splats(model, cameras))), frame)
     with torch.no_grad():
         errors = [(draw(whole, camera).rgb - render_view(model, camera).rgb).square().mean() for camera in cameras]
     assert math.sqrt(sum(errors) / len(errors)) < 0.02
@@ -60,12 +60,12 @@ def test_baked_splats_and_background_look_like_the_model():
 def test_background_splats_are_denser_where_cameras_look():
     model = sky_model(2.0)
     camera = camera_at((0, -3, 0), width=64, height=64, focal=64)
-    splats = background_splats(model, [camera])
+    splats = make_background_splats(model, [camera])
     assert 384 < len(splats) <= 1000
     ahead = splats.positions[:, 1] / np.linalg.norm(splats.positions, axis=1) > math.cos(0.6)
     assert ahead.mean() > 3 * (1 - math.cos(0.6)) / 2  # three times the share of a uniform sphere
     assert splats.scales[ahead].mean() < splats.scales[~ahead].mean()
-    assert len(background_splats(model, [])) <= 1000
+    assert len(make_background_splats(model, [])) <= 1000
 
 
 @pytest.mark.acceptance
@@ -82,7 +82,7 @@ def test_cells_add_up_the_light_that_all_cameras_see():
 
 def test_background_splats_lie_on_the_sphere_around_the_frame():
     frame = Frame((30.0, 10.0, -5.0), 4.0, (1.0, 1.0, 0.5))
-    splats = background_splats(sky_model(frame=frame), ring(3))
+    splats = make_background_splats(sky_model(frame=frame), ring(3))
     radii = np.linalg.norm(splats.positions - frame.center, axis=1) / frame.scale
     assert radii.min() == pytest.approx(BACKGROUND_RADIUS) and radii.max() < 2 * BACKGROUND_RADIUS
     assert splats.degree == 0 and np.array_equal(splats.quats, np.eye(1, 4).repeat(len(splats), 0))
@@ -90,21 +90,21 @@ def test_background_splats_lie_on_the_sphere_around_the_frame():
 
 def test_a_narrow_view_of_the_background_has_no_holes():
     camera = camera_at((0, -3, 0), (0, 0, 4), width=32, height=32, focal=200)  # the field of view is 9 degrees
-    splats = background_splats(sky_model(0.0), [camera])
+    splats = make_background_splats(sky_model(0.0), [camera])
     drawn = draw(Drawable.from_splats(splats, Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))), camera)
     assert drawn.transmittance.max() < 0.25 and drawn.transmittance.mean() < 0.05
 
 
 def test_models_without_a_background_have_no_background_splats_and_no_picture():
     model = small_model(GAUSSIAN_POSITIONS, solid=(1.0, 1.0, 1.0))
-    assert len(background_splats(model, ring(2))) == 0
+    assert len(make_background_splats(model, ring(2))) == 0
     with pytest.raises(ValueError):
-        background_picture(model)
+        render_background_picture(model)
 
 
 def test_the_picture_has_z_in_the_middle_up_at_the_top_and_x_to_the_right():
     model = sky_model(frame=Frame((5.0, 6.0, 7.0), 2.0, (1.0, 0.5, 0.25)))
-    picture = background_picture(model, 256)
+    picture = render_background_picture(model, 256)
     assert picture.shape == (256, 512, 3) and picture.dtype == np.float32
     # A camera without rotation has x right, y down and z ahead; transparent Gaussians leave the sphere visible.
     pose = np.eye(4)
@@ -121,7 +121,7 @@ def test_the_picture_has_z_in_the_middle_up_at_the_top_and_x_to_the_right():
 
 def test_the_default_size_of_the_picture_follows_the_finest_grid():
     # The height is pi / 2 times the 12 cells of the finest grid.
-    assert background_picture(sky_model()).shape == (
+    assert render_background_picture(sky_model()).shape == (
         19,
         38,
         3,
@@ -132,6 +132,6 @@ def test_a_background_that_is_not_finite_is_refused():
     model = sky_model()
     with torch.no_grad():
         model.radiance.biases[-1][0] = torch.nan
-    for use in (lambda: background_splats(model, ring(1)), lambda: background_picture(model, 8)):
+    for use in (lambda: make_background_splats(model, ring(1)), lambda: render_background_picture(model, 8)):
         with pytest.raises(HyrfError, match="NaN"):
             use()

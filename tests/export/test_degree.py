@@ -12,7 +12,7 @@ from hyrfpack.config.export import ExportConfig
 from hyrfpack.export import baked_scene, export_model
 from hyrfpack.export import degree as degrees
 from hyrfpack.export.bake import compute_visibility
-from hyrfpack.export.degree import choose_degree, lowest_degree_within_tolerance
+from hyrfpack.export.degree import choose_degree, choose_lowest_degree
 from hyrfpack.export.source import Source
 from hyrfpack.format import save_model
 from hyrfpack.splats.files import read_splats
@@ -41,7 +41,7 @@ def test_direction_independent_colors_get_degree_0(tmp_path):
 def test_direction_dependent_colors_get_a_higher_degree_and_the_reason_is_reported(tmp_path, caplog):
     source = write_model(tmp_path / "m.hyrf", 4.0, ring(40))
     report = export_model(source, tmp_path / "a.ply")
-    assert report.degree >= 2 and report.degree == lowest_degree_within_tolerance(report.chosen_by)
+    assert report.degree >= 2 and report.degree == choose_lowest_degree(report.chosen_by)
     reason = f"chosen degree {report.degree}: {', '.join(f'{score:.2f}' for score in report.chosen_by.values())} dB"
     assert any(sentence.startswith(reason) for sentence in caplog.messages)
 
@@ -65,7 +65,7 @@ def test_a_given_degree_is_not_compared_with_others(tmp_path, monkeypatch):
     ([40.0], 0),
 ])  # fmt: skip
 def test_the_lowest_degree_within_the_tolerance_is_chosen(scores, lowest):
-    assert lowest_degree_within_tolerance(dict(enumerate(scores))) == lowest
+    assert choose_lowest_degree(dict(enumerate(scores))) == lowest
 
 
 @pytest.mark.parametrize("count", [4, 16, 60])

@@ -14,7 +14,7 @@ from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
 from hyrfpack.export import exposure as export_exposure
-from hyrfpack.export.background import BackgroundGains, background_picture, background_splats
+from hyrfpack.export.background import BackgroundGains, make_background_splats, render_background_picture
 from hyrfpack.export.bake import bake
 from hyrfpack.export.exposure import SMOOTHING_NEIGHBORS, smooth_log_gains
 from hyrfpack.export.poster import render_model_poster
@@ -165,9 +165,9 @@ def sky_between(ahead, behind):
 
 def test_the_background_has_the_exposure_of_the_cameras_that_see_it():
     model, cameras = sky_between(LOG_GAINS, -LOG_GAINS)
-    splats, view_directions = background_splats(model, cameras), [(0, -1, 0), (0, 1, 0)]
+    splats, view_directions = make_background_splats(model, cameras), [(0, -1, 0), (0, 1, 0)]
     directions = splats.positions / np.linalg.norm(splats.positions, axis=1, keepdims=True)
-    picture = background_picture(model, 64, cameras)
+    picture = render_background_picture(model, 64, cameras)
     looked_at = {(0, -1, 0): picture[0, 0], (0, 1, 0): picture[-1, 0]}  # the top row looks along -y
     for camera, direction in zip(cameras, view_directions, strict=True):
         expected = exposed_grey(gains_at(model, camera))

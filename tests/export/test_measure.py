@@ -9,9 +9,9 @@ import pytest
 import torch
 from scenes import camera_at, ring, small_model, view_of
 
-from hyrfpack.export.background import background_picture
+from hyrfpack.export.background import render_background_picture
 from hyrfpack.export.bake import bake
-from hyrfpack.export.measure import _equirect_colors, measure_psnr
+from hyrfpack.export.measure import _sample_panorama, measure_psnr
 from hyrfpack.scene import Camera, Picture
 from hyrfpack.splats.splats import Splats
 
@@ -26,7 +26,7 @@ def empty_splats() -> Splats:
 
 
 def direction_panorama(height: int) -> np.ndarray:
-    """Return (H, 2H, 3) whose colour is (d + 1) / 2 of the direction d, by the closed form in `background_picture`."""
+    """Return (H, 2H, 3) with the colour (d + 1) / 2 of the direction d, as defined at `render_background_picture`."""
     a = 2 * np.pi * (np.arange(2 * height) + 0.5) / (2 * height) - np.pi
     b = (np.pi / 2 - np.pi * (np.arange(height) + 0.5) / height)[:, None]
     d = np.stack(np.broadcast_arrays(np.cos(b) * np.sin(a), -np.sin(b), np.cos(b) * np.cos(a)), -1)
@@ -47,7 +47,7 @@ def ray_directions(camera: Camera) -> np.ndarray:
 @pytest.mark.parametrize("target", [(0, 0, 1), (1, 0, 0), (-1, 0.3, 0.2), (0, 0, -1), (0, -1, 0), (0, 1, 0), (1, 1, 1)])
 def test_a_panorama_is_sampled_correctly_across_the_seam_and_at_the_poles(target):
     camera = camera_at((5.0, -3.0, 700.0), np.add((5.0, -3.0, 700.0), target), (0.1, 0.2, 1), width=31, height=24)
-    seen = _equirect_colors(torch.from_numpy(direction_panorama(180)), camera).numpy()
+    seen = _sample_panorama(torch.from_numpy(direction_panorama(180)), camera).numpy()
     expected = (ray_directions(camera) + 1) / 2
     assert seen.shape == (24, 31, 3)
     # The tolerance is half a pixel at the poles, where no row follows the last one.
@@ -59,14 +59,14 @@ def test_a_panorama_is_interpolated_across_the_seam():
     picture = np.zeros((4, 8, 3), np.float32)
     picture[:, 0], picture[:, -1] = 1.0, 0.5
     camera = camera_at((0, 0, 0), (0, 0, -1), (0, -1, 0), width=101, height=1, focal=1e4)
-    seen = _equirect_colors(torch.from_numpy(picture), camera)
+    seen = _sample_panorama(torch.from_numpy(picture), camera)
     assert torch.allclose(seen[0, 50], torch.full((3,), 0.75), atol=1e-5)  # the middle between the two columns
     assert float(seen.diff(dim=1).abs().max()) < 1e-3
 
 
 def test_the_background_picture_approximates_the_background_of_the_model():
     model = small_model(GAUSSIAN_POSITIONS, fields=1.0, background=True, **INVISIBLE_SETTINGS)
-    picture = background_picture(model, height=128)
+    picture = render_background_picture(model, height=128)
     scores = measure_psnr(model, {"page": (empty_splats(), picture)}, [(c, None) for c in RING_CAMERAS], sphere=True)
     assert scores["page"].model > 40
     without = measure_psnr(model, {"page": (empty_splats(), None)}, [(c, None) for c in RING_CAMERAS], sphere=True)

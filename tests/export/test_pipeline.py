@@ -373,10 +373,10 @@ def test_invisible_rounding_is_not_reported(view_source, tmp_path, caplog):
 
 def test_the_cost_of_a_format_is_measured_on_photos_if_there_are_any():
     """Neither the model's own PSNR nor the similarity of the file's pictures to the model's decides."""
-    cost = {"before": PsnrScores(60, 30.0, 1), "after": PsnrScores(20, 29.7, 1), "error": 1e-9}
-    assert scores._estimate_cost_db(**cost) == pytest.approx(0.3)
-    cost["after"] = PsnrScores(20, None, 1)
-    assert scores._estimate_cost_db(**cost) == pytest.approx(10 * np.log10((1e-9 + 1e-2) / (1e-9 + 1e-6)))
+    baked_scores = PsnrScores(60, 30.0, 1)
+    assert scores._estimate_cost_db(baked_scores, PsnrScores(20, 29.7, 1), 1e-9) == pytest.approx(0.3)
+    cost = scores._estimate_cost_db(baked_scores, PsnrScores(20, None, 1), 1e-9)
+    assert cost == pytest.approx(10 * np.log10((1e-9 + 1e-2) / (1e-9 + 1e-6)))
 
 
 def test_held_out_photos_are_scored_but_not_fitted(plain_file, tmp_path, monkeypatch):
@@ -554,12 +554,12 @@ def test_missing_packages_are_reported_before_the_bake(
         export(plain_file, tmp_path / f"a{ending}", colmap=not ending)
 
 
-@pytest.mark.parametrize("failing", ["encode", "decode", "background_splats"])
+@pytest.mark.parametrize("failing", ["encode", "decode", "make_background_splats"])
 def test_a_failed_export_keeps_the_old_file(failing, sphere_file, tmp_path, monkeypatch):
     def fail(*arguments, **options):
         raise HyrfError("no", fix="none")
 
-    if failing == "background_splats":
+    if failing == "make_background_splats":
         monkeypatch.setattr(baked_scene, failing, fail)
     else:
         monkeypatch.setattr(pipeline, "find_file_kind", lambda *target: replace(FORMATS[".ply"], **{failing: fail}))

@@ -21,7 +21,7 @@ from hyrfpack.cameras.files import cameras_from_json
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.cameras.placement import Placement
 from hyrfpack.edit.transform import move_model, move_provenance, replace_config
-from hyrfpack.export.background import background_picture, background_splats
+from hyrfpack.export.background import make_background_splats, render_background_picture
 from hyrfpack.export.bake import bake
 from hyrfpack.format import save_model
 from hyrfpack.ops.harmonics import harmonics_basis
@@ -129,8 +129,8 @@ def test_exported_splats_of_a_rotated_model_read_back_as_the_moved_ones(ending, 
 def test_background_splats_turn_with_the_model():
     model = model_of_balls()
 
-    before = background_splats(model, CAMERAS)
-    after = background_splats(move_model(STEP, model), [STEP.move_camera(camera) for camera in CAMERAS])
+    before = make_background_splats(model, CAMERAS)
+    after = make_background_splats(move_model(STEP, model), [STEP.move_camera(camera) for camera in CAMERAS])
 
     assert_moved(before, after, (1e-3, 1e-5, 1e-3))
 
@@ -140,7 +140,7 @@ def test_the_background_picture_has_the_axes_of_the_world():
     model = model_of_balls()
     turned = move_model(Placement.rotation_about_axis((0, 1, 0), 90), model)
 
-    before, after = background_picture(model, 32), background_picture(turned, 32)
+    before, after = render_background_picture(model, 32), render_background_picture(turned, 32)
 
     assert np.abs(before - after).max() > 0.01
     np.testing.assert_allclose(after, np.roll(before, 16, axis=1), rtol=0, atol=1e-5)
@@ -151,9 +151,9 @@ def test_a_half_turn_about_x_turns_the_background_picture_upside_down():
     turned = move_model(Placement.rotation_about_axis((1, 0, 0), 180), model)
 
     # (x, y, z) becomes (x, -y, -z): latitudes change their signs, and a longitude a becomes pi - a.
-    expected = np.roll(background_picture(model, 32)[::-1, ::-1], 32, axis=1)
+    expected = np.roll(render_background_picture(model, 32)[::-1, ::-1], 32, axis=1)
 
-    np.testing.assert_allclose(background_picture(turned, 32), expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(render_background_picture(turned, 32), expected, rtol=0, atol=1e-5)
 
 
 def test_exported_cameras_and_points_move_with_the_scene(files, tmp_path):

@@ -8,7 +8,7 @@ from scenes import ring, small_model
 
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
-from hyrfpack.export.pages import choose_start, page_cameras
+from hyrfpack.export.pages import choose_page_cameras, choose_start
 from hyrfpack.export.source import Source
 from hyrfpack.format import save_model
 
@@ -26,7 +26,7 @@ def test_a_camera_inside_haze_is_not_the_first(tmp_path):
     scene = np.random.default_rng(0).uniform(-0.4, 0.4, (60, 3))
     haze = np.repeat(np.array([RING_CAMERAS[0].position + 0.3 * RING_CAMERAS[0].forward]), 6, axis=0)
     loaded = read_source(tmp_path, np.concatenate([scene, haze]), np.array([[-4.0]] * 60 + [[3.0]] * 6))
-    first, *others = page_cameras(loaded)
+    first, *others = choose_page_cameras(loaded)
     assert not np.allclose(first.position, RING_CAMERAS[0].position, atol=1e-4)
     assert len(others) == 7, "a camera is lost"
     angles = [np.arctan2(camera.position[1], camera.position[0]) for camera in [first, *others]]
@@ -36,7 +36,7 @@ def test_a_camera_inside_haze_is_not_the_first(tmp_path):
 
 def test_the_first_photo_stays_first_where_all_see_the_scene(tmp_path):
     loaded = read_source(tmp_path, np.random.default_rng(0).uniform(-0.4, 0.4, (60, 3)))
-    assert np.allclose(page_cameras(loaded)[0].position, RING_CAMERAS[0].position, atol=1e-4)
+    assert np.allclose(choose_page_cameras(loaded)[0].position, RING_CAMERAS[0].position, atol=1e-4)
 
 
 @pytest.mark.unit

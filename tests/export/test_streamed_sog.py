@@ -203,7 +203,7 @@ def test_errors_rise_from_zero_with_the_level(exported):
 def test_the_error_of_a_level_is_the_mean_of_its_measured_errors_and_never_falls():
     levels = [(0.0, 0.0), (0.02, 0.04), (0.01, 0.01)]
     chunk = Chunk((0, 0, 0), (1, 1, 1), tuple(ChunkLevel("a.hyrf", 1, "00000000", 1, errors) for errors in levels))
-    np.testing.assert_allclose(streamed_sog.level_errors(chunk, 4), [0, 0.03, 0.03, 0.03])
+    np.testing.assert_allclose(streamed_sog.compute_level_errors(chunk, 4), [0, 0.03, 0.03, 0.03])
 
 
 def test_the_background_is_the_environment(exported):

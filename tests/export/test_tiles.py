@@ -18,7 +18,7 @@ import hyrfpack
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
-from hyrfpack.export.tiles import geometric_errors
+from hyrfpack.export.tiles import compute_geometric_errors
 from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, ScenePart
 from hyrfpack.lod.select import predict_errors
 from hyrfpack.rotations import rotation_matrices
@@ -239,14 +239,14 @@ RADII_PIXELS = (16.0, 64.0, 256.0)
 
 
 def test_the_geometric_error_of_a_constant_error_is_proportional_to_its_root():
-    errors = geometric_errors(make_chunk((0, 0, 0), (0.01,) * 3, (0.04,) * 3), RADII_PIXELS)
+    errors = compute_geometric_errors(make_chunk((0, 0, 0), (0.01,) * 3, (0.04,) * 3), RADII_PIXELS)
     np.testing.assert_allclose(errors, [0, 4 * 3 * 0.1, 4 * 3 * 0.2])  # the radius is 3
 
 
 @pytest.mark.parametrize("errors", [(0.09, 0.1, 0.2), (0.0, 0.004, 0.001), (0.0002, 0.0001, 0.0001), (0.0, 0.0, 0.001)])
 def test_a_client_switches_where_the_predicted_error_is_that_of_the_wrong_disc(errors):
     chunk = make_chunk((0, 0, 0), errors)
-    error = geometric_errors(chunk, RADII_PIXELS)[1]
+    error = compute_geometric_errors(chunk, RADII_PIXELS)[1]
     frame = {"center": [0, 0, 0], "scale": 1, "half_sides": [1, 1, 1]}
     manifest = Manifest(1, (ScenePart("a.hyrf", 1, "00000000"),), (chunk,), RADII_PIXELS, frame, False, (0, 0, 0))
     focal = 40_000.0  # so long that the chunk is small in the picture even where it is close
@@ -258,7 +258,7 @@ def test_a_client_switches_where_the_predicted_error_is_that_of_the_wrong_disc(e
 
 
 def test_a_level_without_measured_error_replaces_the_finest_one_at_any_distance():
-    assert geometric_errors(make_chunk((0, 0, 0), (0, 0, 0)), RADII_PIXELS) == [0, 0]
+    assert compute_geometric_errors(make_chunk((0, 0, 0), (0, 0, 0)), RADII_PIXELS) == [0, 0]
 
 
 def test_one_export_writes_one_kind_of_folder(scene, tmp_path):

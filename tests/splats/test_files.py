@@ -12,7 +12,7 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.files import MAX_FILE_BYTES, READABLE_ENDINGS, bytes_on_disk, list_source_files, read_splats
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.hints import Hints
-from hyrfpack.splats.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalize_quats
 from hyrfpack.splats.table import FORMATS
 
 UP_DIRECTION = np.array([0.0, -1.0, 0.0])
@@ -30,7 +30,7 @@ def random_splats(count: int = 50, center=(0, 0, 0), unit: float = 1.0) -> Splat
     return Splats(
         generator.uniform(-1, 1, (count, 3)) * unit + center,
         unit * np.exp(generator.uniform(-5, -1, (count, 3))),
-        normalized_quats(generator.normal(size=(count, 4))),
+        normalize_quats(generator.normal(size=(count, 4))),
         generator.uniform(0.01, 0.99, count),
         generator.normal(size=(count, 16, 3)) * 0.1,
     )
@@ -128,7 +128,7 @@ def test_the_error_for_a_folder_without_a_sog_lists_its_files(holds, message_par
     for source in (tmp_path, tmp_path / "meta.json"):
         with pytest.raises(HyrfDataError) as refusal:
             read_splats(source)
-        assert "a folder is read as a loose SOG, meta.json with its pictures" in str(refusal.value)
+        assert "a folder of splats is an unbundled SOG, meta.json with its pictures" in str(refusal.value)
         assert message_part in str(refusal.value)
 
 
@@ -144,6 +144,13 @@ def test_the_error_for_a_folder_names_no_point_cloud(tmp_path):
     (tmp_path / "level" / "0_0" / "meta.json").touch()
     with pytest.raises(HyrfDataError, match="name 0_0 in it"):
         read_splats(tmp_path / "level")
+
+
+@pytest.mark.parametrize("ending", [".ply", ".spz"])
+def test_the_error_for_a_folder_names_no_folder_with_the_ending_of_splats(ending, tmp_path):
+    (tmp_path / f"backup{ending}").mkdir()
+    with pytest.raises(HyrfDataError, match=f"holds backup{ending}; name another folder, or use 'hyrfpack make'"):
+        read_splats(tmp_path)
 
 
 def test_a_model_is_not_read_as_splats(tmp_path):

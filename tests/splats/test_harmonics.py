@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
 from hyrfpack.ops.harmonics import harmonics_basis, num_sh_bases
-from hyrfpack.splats.harmonics import SH_C0, harmonics_rotation
+from hyrfpack.splats.harmonics import SH_C0, compute_harmonics_rotation
 
 RANDOM_GENERATOR = np.random.default_rng(0)
 
@@ -50,18 +50,18 @@ def test_the_basis_of_a_lower_degree_is_the_first_columns(degree):
 def test_rotated_coefficients_give_the_rotated_function(degree):
     turn, d = Rotation.random(rng=1).as_matrix(), random_directions(40)
     coefficients = RANDOM_GENERATOR.normal(size=num_sh_bases(degree))
-    turned = harmonics_rotation(turn, degree) @ coefficients
+    turned = compute_harmonics_rotation(turn, degree) @ coefficients
     assert np.allclose(evaluate_basis(d, degree) @ turned, evaluate_basis(d @ turn, degree) @ coefficients, atol=1e-12)
 
 
 def test_rotations_of_coefficients_compose_and_keep_norms():
     first, second = Rotation.random(2, rng=2).as_matrix()
-    both = harmonics_rotation(second, 3) @ harmonics_rotation(first, 3)
-    assert np.allclose(both, harmonics_rotation(second @ first, 3), atol=1e-12)
+    both = compute_harmonics_rotation(second, 3) @ compute_harmonics_rotation(first, 3)
+    assert np.allclose(both, compute_harmonics_rotation(second @ first, 3), atol=1e-12)
     assert np.allclose(both @ both.T, np.eye(16), atol=1e-12)
 
 
 def test_a_half_turn_about_x_only_changes_signs():
-    signs = harmonics_rotation(np.diag([1.0, -1.0, -1.0]), 3)
+    signs = compute_harmonics_rotation(np.diag([1.0, -1.0, -1.0]), 3)
     assert np.allclose(np.abs(signs), np.eye(16), atol=1e-12)
     assert np.diagonal(signs)[:4].round().tolist() == [1, -1, -1, 1]  # the signs of 1, -y, z, -x

@@ -9,7 +9,7 @@ from hyrfpack.model import Frame
 from hyrfpack.rotations import quaternion_from_matrix
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
-from hyrfpack.splats.splats import Splats, concatenate, normalized_quats
+from hyrfpack.splats.splats import Splats, concatenate, normalize_quats
 
 UNIT_FRAME = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
 
@@ -19,7 +19,7 @@ def random_splats(count: int, degree: int = 3, seed: int = 0) -> Splats:
     return Splats(
         generator.uniform(-0.6, 0.6, (count, 3)),
         generator.uniform(0.02, 0.2, (count, 3)),
-        normalized_quats(generator.normal(size=(count, 4))),
+        normalize_quats(generator.normal(size=(count, 4))),
         generator.uniform(0.2, 1, count),
         generator.normal(0, 0.3, (count, (degree + 1) ** 2, 3)),
     )
@@ -72,7 +72,7 @@ def test_quaternions_of_matrices_equal_those_of_scipy(turn):
 
 
 def test_zero_quaternions_become_the_identity():
-    quats = normalized_quats([[0, 0, 0, 0], [-2, 0, 0, 0], [0, 0, 3, 4]])
+    quats = normalize_quats([[0, 0, 0, 0], [-2, 0, 0, 0], [0, 0, 3, 4]])
     assert np.allclose(quats, [[1, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0.6, 0.8]])
 
 

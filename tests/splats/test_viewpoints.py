@@ -14,7 +14,7 @@ from hyrfpack.splats.viewpoints import (
     MIN_COVERAGE,
     OUTSIDE_DISTANCE_RANGE_RADII,
     WeightedSplats,
-    coverage,
+    measure_coverage,
     sample_viewpoints,
 )
 
@@ -46,8 +46,8 @@ def test_cameras_are_outside_objects_and_inside_rooms() -> None:
 
 def test_cameras_have_enough_coverage_and_little_clutter() -> None:
     weighted, drawable, cameras = sample_cameras(solid_ball())
-    assert min(coverage(drawable, camera) for camera in cameras) >= MIN_COVERAGE
-    assert max(weighted.clutter(camera.position) for camera in cameras) <= MAX_CLUTTER
+    assert min(measure_coverage(drawable, camera) for camera in cameras) >= MIN_COVERAGE
+    assert max(weighted.estimate_clutter(camera.position) for camera in cameras) <= MAX_CLUTTER
     reach = weighted.radius * OUTSIDE_DISTANCE_RANGE_RADII[1] + 1
     assert max(np.linalg.norm(camera.position) for camera in cameras) <= reach
 
@@ -80,12 +80,12 @@ def test_sampling_a_quarter_of_the_splats_gives_similar_scores(monkeypatch: pyte
     splats = solid_ball()
     faint = replace(splats, opacities=splats.opacities * 0.1)
     weighted, drawable, cameras = sample_cameras(faint)
-    covered = [coverage(drawable, camera) for camera in cameras]
-    cluttered = [weighted.clutter(camera.position, 1.0) for camera in cameras]
+    covered = [measure_coverage(drawable, camera) for camera in cameras]
+    cluttered = [weighted.estimate_clutter(camera.position, 1.0) for camera in cameras]
 
     monkeypatch.setattr(views, "MAX_SAMPLED_SPLATS", len(faint) // 4)
 
-    np.testing.assert_allclose([coverage(drawable, camera) for camera in cameras], covered, atol=0.1)
+    np.testing.assert_allclose([measure_coverage(drawable, camera) for camera in cameras], covered, atol=0.1)
     np.testing.assert_allclose(
-        [weighted.clutter(camera.position, 1.0) for camera in cameras], cluttered, rtol=0.3, atol=0.01
+        [weighted.estimate_clutter(camera.position, 1.0) for camera in cameras], cluttered, rtol=0.3, atol=0.01
     )

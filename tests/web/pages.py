@@ -15,7 +15,7 @@ from hyrfpack.cameras.paths import look_at
 from hyrfpack.model import Frame
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
-from hyrfpack.splats.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalize_quats
 from hyrfpack.web.html import encode_splats_page
 from tools.browser.browser import Browser
 
@@ -32,7 +32,7 @@ def random_splats(count: int = 1500, degree: int = 3, seed: int = 1) -> Splats:
     return Splats(
         SCENE_CENTER + rng.normal(size=(count, 3)) * 0.5,
         np.exp(rng.normal(-3.3, 0.8, (count, 3))),
-        normalized_quats(rng.normal(size=(count, 4))),
+        normalize_quats(rng.normal(size=(count, 4))),
         rng.uniform(size=count),
         harmonics,
     ).with_degree(degree)

@@ -19,7 +19,7 @@ from hyrfpack.cameras.paths import look_at
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import Frame
 from hyrfpack.scene import Camera
-from hyrfpack.splats.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalize_quats
 from hyrfpack.web.html import decode_splats_page, encode_model_page, encode_splats_page, extract_payload
 from hyrfpack.web.player import (
     assemble_player_page,
@@ -39,7 +39,7 @@ def random_splats(count: int = 1500) -> Splats:
     """Return splats of all shapes around SCENE_CENTER, far from the origin."""
     rng = np.random.default_rng(1)
     harmonics = rng.normal(size=(count, 16, 3)) * np.array([0.8] + [0.12] * 15)[:, None]
-    shapes = np.exp(rng.normal(-3.3, 0.8, (count, 3))), normalized_quats(rng.normal(size=(count, 4)))
+    shapes = np.exp(rng.normal(-3.3, 0.8, (count, 3))), normalize_quats(rng.normal(size=(count, 4)))
     return Splats(SCENE_CENTER + rng.normal(size=(count, 3)) * 0.5, *shapes, rng.uniform(size=count), harmonics)
 
 

@@ -21,7 +21,7 @@ import numpy as np
 
 import hyrfpack
 from hyrfpack.choices import DEFAULT_SPZ_VERSION
-from hyrfpack.export.background import background_picture, background_splats
+from hyrfpack.export.background import make_background_splats, render_background_picture
 from hyrfpack.export.bake import bake
 from hyrfpack.export.kinds import HTML_PAGE
 from hyrfpack.export.measure import PsnrScores, measure_psnr
@@ -66,14 +66,14 @@ def main() -> None:
     print(f"{len(source.model):,} Gaussians, {len(source.measured_views)} views; baked in {seconds:.1f} s", end="")
     background, picture = None, None
     if source.model.config.background:
-        background, seconds = time_action(lambda: background_splats(source.model, source.fit_cameras))
-        picture = background_picture(source.model, cameras=source.fit_cameras)
+        background, seconds = time_action(lambda: make_background_splats(source.model, source.fit_cameras))
+        picture = render_background_picture(source.model, cameras=source.fit_cameras)
         print(f", the background as {len(background):,} more in {seconds:.1f} s", end="")
     splats_with_background = {
         d: splats if background is None else concatenate((splats, background)) for d, splats in baked.items()
     }
-    own = measure_scores(source, {})["model"]
-    print(f"; the model itself: {arguments.model.stat().st_size:,} bytes, {own.photos:.2f} dB on photos\n")
+    model_scores = measure_scores(source, {})["model"]
+    print(f"; the model itself: {arguments.model.stat().st_size:,} bytes, {model_scores.photos:.2f} dB on photos\n")
     print("| format | degree | bytes | write (s) | read (s) | dB, model | dB, photos | checked by |")
     print("|---|---|---|---|---|---|---|---|")
     for name in formats:

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from hyrfpack.quant.morton import morton_codes
 from hyrfpack.splats.formats.palette import build_palette, find_nearest_entries
-from hyrfpack.splats.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalize_quats
 
 MAX_OPACITY_LOGIT = 7.0  # opacities are clamped to 1 - 1e-3; the rasteriser clamps alpha to 0.99
 MIN_SCALE = 4.5e-5  # world units, far below a pixel; also the smallest scale of SPZ
@@ -73,7 +73,7 @@ def round_trip(splats: Splats, clusters: int) -> tuple[int, Splats]:
         splats,
         positions=decoded["means"],
         scales=np.exp(decoded["scales"]),
-        quats=normalized_quats(decoded["quats"]),
+        quats=normalize_quats(decoded["quats"]),
         opacities=expit(decoded["opacities"]),
         harmonics=np.concatenate([decoded[name] for name in ("sh0", "shN") if name in decoded], axis=1),
     )

@@ -19,12 +19,12 @@ Files of this format are read, not written. They have up to three elements.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.ply import read_elements, read_header, stack_columns
+from hyrfpack.ply import PlyHeader, read_elements, read_header, stack_columns
 from hyrfpack.splats.formats.smallest_three import restore_largest
 from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.harmonics import SH_C0
@@ -52,69 +52,75 @@ def decode(data: bytes, name: str) -> Splats:
         HyrfDataError: the file is not a compressed PLY of Gaussians, or it is damaged.
     """
     header = read_header(data, name)
-    properties_by_element = {label: element.properties for label, element in header.elements.items()}
-    colored = "min_r" in properties_by_element.get("chunk", {})
-    _require_properties(properties_by_element, "vertex", _PACKED_PROPERTIES, "u4", name)
-    for parts in (_POSITION_BOUNDS, _SCALE_BOUNDS) + ((_COLOR_BOUNDS,) if colored else ()):
-        _require_properties(
-            properties_by_element,
-            "chunk",
-            [*_bound_properties("min", parts), *_bound_properties("max", parts)],
-            "f4",
-            name,
-        )
-    rest = [f"f_rest_{index}" for index in range(len(properties_by_element.get("sh", {})))]
-    if len(rest) not in (0, 9, 24, 45):
-        raise HyrfDataError(
-            f"{name}: the element 'sh' has {len(rest)} properties, but a degree of harmonics needs 9, 24 or 45",
-            fix="export it again",
-        )
-    _require_properties(properties_by_element, "sh", rest, "u1", name)
-    if header.order == "=":
-        raise HyrfDataError(f"{name}: a compressed PLY file in text cannot be read", fix="export it as a binary one")
-    rows = read_elements(data, header, {"vertex", "chunk"} | ({"sh"} if rest else set()), name)
+    has_color_bounds, harmonics_properties = _check_properties(header, name)
+    elements = {"vertex", "chunk"} | ({"sh"} if harmonics_properties else set())
+    rows = read_elements(data, header, elements, name)
+    _check_row_counts(rows, name)
     vertex, chunk = rows["vertex"], rows["chunk"]
-    count = len(vertex)
-    if rest and len(rows["sh"]) != count:
-        raise HyrfDataError(
-            f"{name}: its element 'sh' has {len(rows['sh']):,} rows for {count:,} Gaussians",
-            fix="the file is damaged, export it again",
-        )
-    if len(chunk) != -(-count // _GAUSSIANS_PER_CHUNK):
-        raise HyrfDataError(
-            f"{name}: {len(chunk):,} chunks do not fit {count:,} Gaussians, {_GAUSSIANS_PER_CHUNK} each",
-            fix="the file is damaged, export it again",
-        )
-    color_and_opacity = _unpack_fractions(vertex["packed_color"], (24, 16, 8, 0), (8, 8, 8, 8))
-    harmonics = np.empty((count, len(rest) // 3 + 1, 3), np.float32)
+    color_fractions = _unpack_fractions(vertex["packed_color"], (24, 16, 8, 0), (8, 8, 8, 8))
+    position_fractions = _unpack_fractions(vertex["packed_position"], *_SHIFTS_AND_WIDTHS_11_10_11)
+    scale_fractions = _unpack_fractions(vertex["packed_scale"], *_SHIFTS_AND_WIDTHS_11_10_11)
+    colors, opacities = color_fractions[:, :3], color_fractions[:, 3]
+    terms = len(harmonics_properties) // 3
+    harmonics = np.empty((len(vertex), terms + 1, 3), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # infinite results are rejected below; a NaN may warn
-        colors = (
-            _interpolate_in_chunk(chunk, _COLOR_BOUNDS, color_and_opacity[:, :3])
-            if colored
-            else color_and_opacity[:, :3]
-        )
+        if has_color_bounds:
+            colors = _interpolate_in_chunk(chunk, _COLOR_BOUNDS, colors)
         harmonics[:, 0] = (colors - 0.5) / SH_C0
-        if rest:
-            harmonics[:, 1:] = (
-                _HARMONIC_BY_BYTE[stack_columns(rows["sh"], rest)].reshape(count, 3, len(rest) // 3).transpose(0, 2, 1)
-            )
+        if terms:
+            higher = _HARMONIC_BY_BYTE[stack_columns(rows["sh"], harmonics_properties)]
+            harmonics[:, 1:] = higher.reshape(len(vertex), 3, terms).transpose(0, 2, 1)
         return build_valid_splats(
             name,
-            _interpolate_in_chunk(
-                chunk, _POSITION_BOUNDS, _unpack_fractions(vertex["packed_position"], *_SHIFTS_AND_WIDTHS_11_10_11)
-            ),
-            np.exp(
-                _interpolate_in_chunk(
-                    chunk, _SCALE_BOUNDS, _unpack_fractions(vertex["packed_scale"], *_SHIFTS_AND_WIDTHS_11_10_11)
-                )
-            ),
+            _interpolate_in_chunk(chunk, _POSITION_BOUNDS, position_fractions),
+            np.exp(_interpolate_in_chunk(chunk, _SCALE_BOUNDS, scale_fractions)),
             _unpack_rotations(vertex["packed_rotation"]),
-            color_and_opacity[:, 3],
+            opacities,
             harmonics,
         )
 
 
-def _bound_properties(end: str, parts: Sequence[str]) -> list[str]:
+def _check_properties(header: PlyHeader, name: str) -> tuple[bool, list[str]]:
+    """Check that a header has the properties of a compressed PLY.
+
+    Returns:
+        Whether chunks bound the colours, and the names of the properties of higher harmonics, 0, 9, 24 or 45.
+    """
+    properties_by_element = {label: element.properties for label, element in header.elements.items()}
+    has_color_bounds = "min_r" in properties_by_element.get("chunk", {})
+    _require_properties(properties_by_element, "vertex", _PACKED_PROPERTIES, "u4", name)
+    for parts in (_POSITION_BOUNDS, _SCALE_BOUNDS) + ((_COLOR_BOUNDS,) if has_color_bounds else ()):
+        bounds = [*_list_bounds("min", parts), *_list_bounds("max", parts)]
+        _require_properties(properties_by_element, "chunk", bounds, "f4", name)
+    harmonics_properties = [f"f_rest_{index}" for index in range(len(properties_by_element.get("sh", {})))]
+    if len(harmonics_properties) not in (0, 9, 24, 45):
+        raise HyrfDataError(
+            f"{name}: the element 'sh' has {len(harmonics_properties)} properties, but a degree of harmonics needs 9, "
+            "24 or 45",
+            fix="export it again",
+        )
+    _require_properties(properties_by_element, "sh", harmonics_properties, "u1", name)
+    if header.order == "=":
+        raise HyrfDataError(f"{name}: a compressed PLY file in text cannot be read", fix="export it as a binary one")
+    return has_color_bounds, harmonics_properties
+
+
+def _check_row_counts(rows: Mapping[str, np.ndarray], name: str) -> None:
+    """Check that the chunks, and the higher harmonics if there are any, belong to as many Gaussians as there are."""
+    count, chunk_count = len(rows["vertex"]), len(rows["chunk"])
+    if "sh" in rows and len(rows["sh"]) != count:
+        raise HyrfDataError(
+            f"{name}: its element 'sh' has {len(rows['sh']):,} rows for {count:,} Gaussians",
+            fix="the file is damaged, export it again",
+        )
+    if chunk_count != -(-count // _GAUSSIANS_PER_CHUNK):
+        raise HyrfDataError(
+            f"{name}: {chunk_count:,} chunks do not fit {count:,} Gaussians, {_GAUSSIANS_PER_CHUNK} each",
+            fix="the file is damaged, export it again",
+        )
+
+
+def _list_bounds(end: str, parts: Sequence[str]) -> list[str]:
     return [f"{end}_{part}" for part in parts]
 
 
@@ -140,7 +146,7 @@ def _interpolate_in_chunk(chunk: np.ndarray, parts: Sequence[str], fractions: np
     """Interpolate linearly between the bounds of each Gaussian's chunk, by fractions (N, 3) in [0, 1]."""
     chunk_index = np.arange(len(fractions)) // _GAUSSIANS_PER_CHUNK
     low, high = (
-        stack_columns(chunk, _bound_properties(end, parts)).astype(np.float64)[chunk_index] for end in ("min", "max")
+        stack_columns(chunk, _list_bounds(end, parts)).astype(np.float64)[chunk_index] for end in ("min", "max")
     )
     return low * (1 - fractions) + high * fractions
 

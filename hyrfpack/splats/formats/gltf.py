@@ -33,9 +33,9 @@ from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.placement import (
     apply_transform,
+    choose_local_origin,
     decompose_similarity,
-    local_origin,
-    local_positions,
+    subtract_origin,
     upright_rotation,
 )
 from hyrfpack.splats.splats import Splats, concatenate
@@ -72,7 +72,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     Raises:
         HyrfDataError: there are no splats, or they do not fit into float32 or into 4 GiB.
     """
-    return encode_at(splats, local_origin(splats.positions), upright_rotation(hints.up, np.array(GLTF_UP)))
+    return encode_at(splats, choose_local_origin(splats.positions), upright_rotation(hints.up, np.array(GLTF_UP)))
 
 
 def encode_at(splats: Splats, origin: np.ndarray, turn: np.ndarray) -> bytes:
@@ -82,12 +82,12 @@ def encode_at(splats: Splats, origin: np.ndarray, turn: np.ndarray) -> bytes:
         HyrfDataError: there are no splats, or they do not fit into float32 or into 4 GiB.
     """
     _check_not_empty(splats)
-    attributes = {"POSITION": local_positions(splats, origin)}
-    attributes["COLOR_0"] = linear_colors(splats)
+    attributes = {"POSITION": subtract_origin(splats, origin)}
+    attributes["COLOR_0"] = encode_linear_colors(splats)
     attributes[f"{SPLATTING_EXTENSION}:ROTATION"] = splats.quats[:, [1, 2, 3, 0]]
     attributes[f"{SPLATTING_EXTENSION}:SCALE"] = splats.scales
     attributes[f"{SPLATTING_EXTENSION}:OPACITY"] = splats.opacities[:, None]
-    for term, semantic in enumerate(_harmonics_semantics(splats.degree)):
+    for term, semantic in enumerate(_list_harmonics_semantics(splats.degree)):
         attributes[semantic] = splats.harmonics[:, term]
 
     accessors, views, parts = _pack_attributes(list(attributes.values()))
@@ -123,7 +123,7 @@ def encode_compressed(splats: Splats) -> tuple[bytes, Splats]:
         f"{SPLATTING_EXTENSION}:ROTATION": {"componentType": _FLOAT_TYPE, "type": "VEC4", **count},
         f"{SPLATTING_EXTENSION}:SCALE": {**vector, **count},
     }
-    for semantic in _harmonics_semantics(splats.degree)[1:]:
+    for semantic in _list_harmonics_semantics(splats.degree)[1:]:
         accessors[semantic] = {**vector, **count}
     data = spz.encode(splats, Hints(spz_version=spz.VERSION_IN_GLTF))
     views = [{"buffer": 0, "byteLength": len(data)}]
@@ -215,21 +215,22 @@ def decode(data: bytes, name: str, *, upright: bool = False) -> Splats:
     """
     content, binary = _read_chunks(data, name)
     try:
-        found = list(_find_splat_primitives(content, name))
-        if not found:
+        transformed_primitives = list(_find_splat_primitives(content, name))
+        if not transformed_primitives:
             raise HyrfDataError(
                 f"{name}: there are no Gaussian splats in it ({SPLATTING_EXTENSION})",
                 fix="name another file",
             )
         counts = [
-            integer(_get_item(content, "accessors", item["attributes"]["POSITION"])["count"]) for _, item in found
+            integer(_get_item(content, "accessors", item["attributes"]["POSITION"])["count"])
+            for _, item in transformed_primitives
         ]
         if sum(max(count, 0) for count in counts) * _MIN_BYTES_PER_SPLAT > len(data):
             raise HyrfDataError(f"{name}: its nodes show the same splats many times", fix="export each once")
-        turn = np.eye(3) if upright else decompose_similarity(found[0][0], name)[1].T
+        last_rotation = np.eye(3) if upright else decompose_similarity(transformed_primitives[0][0], name)[1].T
         parts = [
-            apply_transform(_read_primitive(content, binary, primitive, name), matrix, turn, name)
-            for matrix, primitive in found
+            apply_transform(_read_primitive(content, binary, primitive, name), matrix, last_rotation, name)
+            for matrix, primitive in transformed_primitives
         ]
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise HyrfDataError(
@@ -254,13 +255,13 @@ def _pack_attributes(arrays: list[np.ndarray]) -> tuple[list[dict[str, Any]], li
     return accessors, views, parts
 
 
-def _harmonics_semantics(degree: int) -> list[str]:
+def _list_harmonics_semantics(degree: int) -> list[str]:
     return [
         f"{SPLATTING_EXTENSION}:SH_DEGREE_{band}_COEF_{n}" for band in range(degree + 1) for n in range(2 * band + 1)
     ]
 
 
-def linear_colors(splats: Splats) -> np.ndarray:
+def encode_linear_colors(splats: Splats) -> np.ndarray:
     """Return the colours of degree 0 as linear RGB, as glTF defines COLOR_0, with the opacities: (N, 4) uint8."""
     return np.round(255 * np.column_stack((linear_from_srgb(splats.base_colors), splats.opacities))).astype(np.uint8)
 
@@ -312,23 +313,23 @@ def _read_chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
 def _find_splat_primitives(content: dict[str, Any], name: str) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
     """Yield the world transform (4, 4) and the primitive of all splats in the default scene, depth first."""
     scene = _get_item(content, "scenes", content.get("scene", 0))
-    waiting = [(number, np.eye(4)) for number in reversed(scene.get("nodes", []))]
+    pending = [(number, np.eye(4)) for number in reversed(scene.get("nodes", []))]
     visited: set[int] = set()
-    while waiting:
-        number, above = waiting.pop()
+    while pending:
+        number, parent_matrix = pending.pop()
         if number in visited or len(visited) >= _MAX_NODES:
             raise HyrfDataError(f"{name}: its nodes form no tree, or more than {_MAX_NODES:,}", fix="export it again")
         visited.add(number)
         node = _get_item(content, "nodes", number)
-        matrix = above @ _local_transform(node)
-        waiting += [(child, matrix) for child in reversed(node.get("children", []))]
+        matrix = parent_matrix @ _compute_local_transform(node)
+        pending += [(child, matrix) for child in reversed(node.get("children", []))]
         if "mesh" in node:
             for primitive in _get_item(content, "meshes", node["mesh"])["primitives"]:
                 if SPLATTING_EXTENSION in primitive.get("extensions", {}):
                     yield matrix, primitive
 
 
-def _local_transform(node: dict[str, Any]) -> np.ndarray:
+def _compute_local_transform(node: dict[str, Any]) -> np.ndarray:
     """Return a node's transform (4, 4) for column vectors, from its matrix or its translation, rotation and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
@@ -366,7 +367,7 @@ def _read_primitive(content: dict[str, Any], binary: memoryview, primitive: dict
         read(f"{SPLATTING_EXTENSION}:OPACITY", 1)[:, 0],
     )
     harmonics = np.empty((len(positions), num_sh_bases(degree), 3), np.float32)
-    for term, semantic in enumerate(_harmonics_semantics(degree)):
+    for term, semantic in enumerate(_list_harmonics_semantics(degree)):
         harmonics[:, term] = read(semantic, 3)
     return build_valid_splats(name, positions, scales, quats, opacities, harmonics)
 
@@ -394,8 +395,8 @@ def _read_accessor(content: dict[str, Any], binary: memoryview, accessor: dict, 
             f"{name}: an attribute is {accessor['type']!r:.20}, not of width {width}",
             fix="export it again",
         )
-    within = min(start, length, offset, count) >= 0 and start + length <= len(binary) and stride >= size
-    if not within or (count and offset + stride * (count - 1) + size > length):
+    is_view_valid = min(start, length, offset, count) >= 0 and start + length <= len(binary) and stride >= size
+    if not is_view_valid or (count and offset + stride * (count - 1) + size > length):
         raise HyrfDataError(
             f"{name}: an attribute goes past the end of the data",
             fix="the file is damaged, export it again",

@@ -25,22 +25,20 @@ def build_palette(rows: np.ndarray, weights: np.ndarray, size: int, rounds: int 
         rows: (N, D) float32, N at least 1.
         weights: (N,) weights of the rows, greater than 0.
         size: maximum number of entries.
-        rounds: number of k-means rounds.
+        rounds: number of k-means rounds, at least 1.
 
     Returns:
         (K, D) float32 entries, K = min(size, N).
     """
     rng = np.random.default_rng(0)
     size = min(size, len(rows))
-    shuffled = np.argsort(
-        rng.exponential(size=len(rows)) / weights, kind="stable"
-    )  # weighted sampling without replacement
+    # The rows of the smallest such numbers are a weighted sample without replacement.
+    shuffled = np.argsort(rng.exponential(size=len(rows)) / weights, kind="stable")
     sample = np.sort(rng.permutation(len(rows))[: _SAMPLE_ROWS_PER_ENTRY * size])
     entries = rows[np.sort(shuffled[:size])]
-    for number in range(rounds):
-        last = number == rounds - 1
-        entries = _lloyd_step(rows, weights, entries) if last else _lloyd_step(rows[sample], weights[sample], entries)
-    return entries
+    for _ in range(rounds - 1):
+        entries = _run_lloyd_step(rows[sample], weights[sample], entries)
+    return _run_lloyd_step(rows, weights, entries)
 
 
 def find_nearest_entries(rows: np.ndarray, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -75,7 +73,7 @@ def find_nearest_entries(rows: np.ndarray, entries: np.ndarray) -> tuple[np.ndar
     return labels, distances
 
 
-def _lloyd_step(rows: np.ndarray, weights: np.ndarray, entries: np.ndarray) -> np.ndarray:
+def _run_lloyd_step(rows: np.ndarray, weights: np.ndarray, entries: np.ndarray) -> np.ndarray:
     """Run one k-means round: move each entry to the weighted mean of the rows that are nearest to it."""
     labels, distances = find_nearest_entries(rows, entries)
     mass = np.bincount(labels, weights, len(entries))

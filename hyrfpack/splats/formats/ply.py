@@ -54,14 +54,14 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
             "a Gaussian is farther from the origin than the numbers of PLY can express",
             fix="move the scene to the origin",
         )
-    rest = 3 * (num_sh_bases(splats.degree) - 1)
+    higher_count = 3 * (num_sh_bases(splats.degree) - 1)
     names = (
         *POSITION_PROPERTIES,
         "nx",
         "ny",
         "nz",
         *COLOR_PROPERTIES,
-        *_higher_harmonics_properties(rest),
+        *_list_higher_harmonics(higher_count),
         "opacity",
         *SCALE_PROPERTIES,
         *ROTATION_PROPERTIES,
@@ -105,16 +105,16 @@ def decode_plain(data: bytes, name: str) -> Splats:
     """
     header = read_header(data, name)
     properties = find_properties(header, name)
-    rest = sum(label.startswith("f_rest_") for label in properties)
-    terms = rest // 3 + 1
+    higher_count = sum(label.startswith("f_rest_") for label in properties)
+    terms = higher_count // 3 + 1
     if (
         terms not in (1, 4, 9, 16, 25)
-        or rest % 3
-        or not all(properties.get(label) for label in _higher_harmonics_properties(rest))
+        or higher_count % 3
+        or not all(properties.get(label) for label in _list_higher_harmonics(higher_count))
     ):
         raise HyrfDataError(
-            f"{name}: the file has {rest} properties f_rest_, but a degree of harmonics needs 0, 9, 24, 45 or 72, "
-            "numbered from 0",
+            f"{name}: the file has {higher_count} properties f_rest_, but a degree of harmonics needs 0, 9, 24, 45 or "
+            "72, numbered from 0",
             fix="export it again",
         )
     rows = read_elements(data, header, {"vertex"}, name)["vertex"]
@@ -133,5 +133,5 @@ def decode_plain(data: bytes, name: str) -> Splats:
         )
 
 
-def _higher_harmonics_properties(count: int) -> list[str]:
+def _list_higher_harmonics(count: int) -> list[str]:
     return [f"f_rest_{index}" for index in range(count)]

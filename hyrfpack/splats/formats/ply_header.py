@@ -31,9 +31,9 @@ def find_properties(header: PlyHeader, name: str) -> dict[str, str]:
     properties = vertex.properties if vertex else {}
     missing = [label for label in _REQUIRED_PROPERTIES if not properties.get(label)]
     if missing:
-        shown = ", ".join(missing[:4]) + (f" and {len(missing) - 4} more" if len(missing) > 4 else "")
+        missing_text = ", ".join(missing[:4]) + (f" and {len(missing) - 4} more" if len(missing) > 4 else "")
         raise HyrfDataError(
-            f"{name}: this PLY file holds no Gaussians, because its vertices have no {shown}",
+            f"{name}: this PLY file holds no Gaussians, because its vertices have no {missing_text}",
             fix="give one that a program for 3D Gaussian Splatting wrote",
         )
     return properties

@@ -37,7 +37,7 @@ def restore_largest(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
         (N, 4) quaternions of unit length. Where the others alone are longer than 1, the restored component is 0.
     """
     quats = np.empty((len(others), 4), others.dtype)
-    rest = np.sqrt(np.maximum(0, 1 - (others**2).sum(axis=1, keepdims=True)))
+    restored = np.sqrt(np.maximum(0, 1 - (others**2).sum(axis=1, keepdims=True)))
     np.put_along_axis(quats, _OTHER_COMPONENTS[largest], others, axis=1)
-    np.put_along_axis(quats, largest[:, None].astype(np.intp), rest, axis=1)
+    np.put_along_axis(quats, largest[:, None].astype(np.intp), restored, axis=1)
     return quats

@@ -84,13 +84,13 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     return bundle.getvalue()
 
 
-def encode_files(splats: Splats, runs: Sequence[int] = ()) -> dict[str, bytes]:
+def encode_files(splats: Splats, group_sizes: Sequence[int] = ()) -> dict[str, bytes]:
     """Encode splats as the files of an unbundled SOG, by name; programs open such a folder through its meta.json.
 
     Args:
         splats: the splats.
-        runs: numbers of consecutive splats that stay together, in this order: the Morton curve orders each run by
-            itself. Without any, all splats are one run.
+        group_sizes: sizes of groups of consecutive splats. Groups keep their order, and the Morton curve orders the
+            splats in each group. Without any, all splats are one group.
     """
     count = len(splats)
     if count > _MAX_GAUSSIANS:
@@ -101,8 +101,8 @@ def encode_files(splats: Splats, runs: Sequence[int] = ()) -> dict[str, bytes]:
     log_positions = np.sign(splats.positions) * np.log1p(np.abs(splats.positions))
     mins, maxs = (log_positions.min(0), log_positions.max(0)) if count else (np.zeros(3), np.zeros(3))
     steps = np.rint((log_positions - mins) / np.where(maxs > mins, maxs - mins, 1) * 65535).astype(np.uint16)
-    run_numbers = np.repeat(np.arange(len(runs)), runs) if runs else np.zeros(count, np.int64)
-    order = np.lexsort((morton_codes(steps), run_numbers))  # stable
+    group_numbers = np.repeat(np.arange(len(group_sizes)), group_sizes) if group_sizes else np.zeros(count, np.int64)
+    order = np.lexsort((morton_codes(steps), group_numbers))  # stable
     splats, steps = splats[order], steps[order]
 
     scale_book, scales = _quantize_to_codebook(np.log(np.maximum(splats.scales, _MIN_SCALE)))
@@ -158,13 +158,13 @@ def unzip(data: bytes, name: str) -> dict[str, bytes]:
     files = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            for wanted in (
+            for member_name in (
                 META_NAME,
                 *picture_names(archive.read(_find_member(archive, META_NAME, _MAX_META_BYTES, name)), name),
             ):
-                member = _find_member(archive, wanted, bytes_left, name)
+                member = _find_member(archive, member_name, bytes_left, name)
                 bytes_left -= member.file_size
-                files[wanted] = archive.read(member)
+                files[member_name] = archive.read(member)
     except HyrfDataError:
         raise
     except Exception as error:  # zipfile lets a dozen types of error through from the modules that it uses
@@ -344,9 +344,9 @@ def _read_picture(data: bytes, max_pixels: int, name: str) -> np.ndarray:
             with Image.open(io.BytesIO(data), formats=("WEBP", "PNG")) as picture:
                 # The size is checked before the pixels are decoded.
                 if picture.width * picture.height > max_pixels or picture.mode not in ("RGB", "RGBA"):
-                    found = f"{picture.width} x {picture.height} pixels of {picture.mode}"
+                    description = f"{picture.width} x {picture.height} pixels of {picture.mode}"
                     raise HyrfDataError(
-                        f"{name} has {found}, but must be RGB and not larger than needed",
+                        f"{name} has {description}, but must be RGB and not larger than needed",
                         fix="the file is damaged, export it again",
                     )
                 return np.asarray(picture.convert("RGBA"))

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,7 +37,7 @@ from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.smallest_three import drop_largest, restore_largest
 from hyrfpack.splats.formats.validation import build_valid_splats
-from hyrfpack.splats.harmonics import harmonics_rotation
+from hyrfpack.splats.harmonics import compute_harmonics_rotation
 from hyrfpack.splats.splats import Splats
 
 VERSION_IN_GLTF = 2  # of the draft extension KHR_gaussian_splatting_compression_spz_2
@@ -100,7 +101,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     if version not in (VERSION_IN_GLTF, *SPZ_VERSIONS):
         raise ValueError(f"SPZ version {version} cannot be written; choose one of {SPZ_VERSIONS}")
     bits = _choose_fractional_bits(splats.positions)
-    signs = _harmonics_signs(splats.degree).astype(np.float32)
+    signs = _compute_harmonics_signs(splats.degree).astype(np.float32)
     sections = (
         _pack_positions(splats.positions * _AXIS_SIGNS, bits),
         _round_to_bytes(splats.opacities * 255),
@@ -141,53 +142,62 @@ def decode(data: bytes, name: str) -> Splats:
             copies of the Gaussians for levels of detail.
     """
     if data[:2] == _GZIP_MAGIC:
-        unpacked = _read_gzip(data, name)
+        header, sections = _read_gzip(data, name)
     elif data[:4] == _MAGIC:
-        unpacked = _read_streams(data, name)
+        header, sections = _read_streams(data, name)
     else:
         raise HyrfDataError(
             f"{name}: this is not an SPZ file, because it starts with the signature of neither gzip nor SPZ",
             fix="check the path",
         )
-    version, degree, bits, flags, sections = unpacked
     positions, opacities, colors, scales, quats, harmonics = (np.frombuffer(part, np.uint8) for part in sections)
     count = len(opacities)
-    rest = harmonics.reshape(count, num_sh_bases(degree) - 1, 3)[:, : num_sh_bases(MAX_DEGREE) - 1]
-    degree = min(degree, MAX_DEGREE)
-    signs = _harmonics_signs(degree).astype(np.float32)
+    higher_codes = harmonics.reshape(count, num_sh_bases(header.degree) - 1, 3)[:, : num_sh_bases(MAX_DEGREE) - 1]
+    degree = min(header.degree, MAX_DEGREE)
+    signs = _compute_harmonics_signs(degree).astype(np.float32)
     terms = np.empty((count, num_sh_bases(degree), 3), np.float32)
     terms[:, 0] = _COLOR_BY_BYTE[colors.reshape(count, 3)]
-    np.multiply(_HARMONIC_BY_BYTE[rest], signs[1:, None], out=terms[:, 1:])
+    np.multiply(_HARMONIC_BY_BYTE[higher_codes], signs[1:, None], out=terms[:, 1:])
     with np.errstate(invalid="ignore"):  # positions of version 1 may be NaN, which is rejected below
         return build_valid_splats(
             name,
-            _unpack_positions(positions, bits, version) * _AXIS_SIGNS,
+            _unpack_positions(positions, header.fractional_bits, header.version) * _AXIS_SIGNS,
             _SCALE_BY_BYTE[scales.reshape(count, 3)],
-            _unpack_quats(quats, version),
+            _unpack_quats(quats, header.version),
             _OPACITY_BY_BYTE[opacities],
             terms,
-            bool(flags & _ANTIALIASED_FLAG),
+            bool(header.flags & _ANTIALIASED_FLAG),
         )
 
 
 # --- containers -------------------------------------------------------------------------------------------------------
 
-_UnpackedFile = tuple[int, int, int, int, list[bytes]]  # version, degree, fractional bits, flags, the six sections
+
+class _Header(NamedTuple):
+    """What the header of a file says about all of its sections."""
+
+    version: int
+    gaussians: int
+    degree: int
+    fractional_bits: int
+    flags: int
+
+    @property
+    def section_lengths(self) -> list[int]:
+        """The number of raw bytes of each section."""
+        quat_bytes = 4 if self.version >= 3 else 3
+        harmonics_bytes = 3 * (num_sh_bases(self.degree) - 1)
+        bytes_per_gaussian = (6 if self.version == 1 else 9, 1, 3, 3, quat_bytes, harmonics_bytes)
+        return [self.gaussians * length for length in bytes_per_gaussian]
 
 
-def _section_lengths(version: int, count: int, degree: int) -> list[int]:
-    """Return the number of raw bytes of each section."""
-    each = (6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * (num_sh_bases(degree) - 1))
-    return [count * length for length in each]
-
-
-def _read_header(header: bytes, versions: range, stored: int, name: str) -> tuple[int, int, int, int, int]:
+def _read_header(data: bytes, versions: range, stored: int, name: str) -> _Header:
     """Read and check a header whose sections come from `stored` bytes.
 
-    Returns:
-        The version, count, degree, fractional bits and flags.
+    Raises:
+        HyrfDataError: the header is none of SPZ, has another version, or promises more than its file can hold.
     """
-    magic, version, count, degree, bits, flags, _ = _HEADER_STRUCT.unpack(header)
+    magic, version, count, degree, bits, flags, _ = _HEADER_STRUCT.unpack(data)
     if magic != _MAGIC:
         raise HyrfDataError(
             f"{name}: this is not an SPZ file, because its contents do not start with 'NGSP'", fix="check the path"
@@ -208,13 +218,14 @@ def _read_header(header: bytes, versions: range, stored: int, name: str) -> tupl
             f"{name}: this SPZ file holds a tree of coarse copies for levels of detail",
             fix="export it without them",
         )
-    length = sum(_section_lengths(version, count, degree))
+    header = _Header(version, count, degree, bits, flags)
+    length = sum(header.section_lengths)
     if length > _UNCHECKED_CONTENT_BYTES and length > _MAX_COMPRESSION_RATIO * stored:
         raise HyrfDataError(
             f"{name}: its header says {count:,} Gaussians, far more than {stored:,} bytes can hold",
             fix="the file is damaged, export it again",
         )
-    return version, count, degree, bits, flags
+    return header
 
 
 def _compress_gzip(contents: list[bytes]) -> bytes:
@@ -243,72 +254,72 @@ def _compress_gzip(contents: list[bytes]) -> bytes:
     return b"".join((_GZIP_MAGIC, b"\x08\0\0\0\0\0\0\xff", *deflated, ending))
 
 
-def _read_gzip(data: bytes, name: str) -> _UnpackedFile:
+def _read_gzip(data: bytes, name: str) -> tuple[_Header, list[bytes]]:
     """Read the sections of a file of version 1 to 3, without unpacking more bytes than the header's count needs."""
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
-        header = stream.decompress(data, _HEADER_STRUCT.size)
-        if len(header) < _HEADER_STRUCT.size:
+        header_bytes = stream.decompress(data, _HEADER_STRUCT.size)
+        if len(header_bytes) < _HEADER_STRUCT.size:
             raise HyrfDataError(
                 f"{name}: the file ends within its header",
                 fix="the file is truncated, export it again",
             )
-        version, count, degree, bits, flags = _read_header(header, range(1, 4), len(data), name)
-        lengths = _section_lengths(version, count, degree)
+        header = _read_header(header_bytes, range(1, 4), len(data), name)
+        lengths = header.section_lengths
         content = stream.decompress(stream.unconsumed_tail, sum(lengths) + 1)
     except zlib.error as error:
         raise HyrfDataError(f"{name}: its gzip stream is damaged ({error})", fix="fetch or export it again") from error
     has_more = len(content) > sum(lengths)
     if len(content) < sum(lengths) or not (stream.eof or has_more):
         raise HyrfDataError(
-            f"{name}: the file ends before its {count:,} Gaussians do",
+            f"{name}: the file ends before its {header.gaussians:,} Gaussians do",
             fix="the file is truncated, export it again",
         )
-    if has_more and not flags & _EXTENSIONS_FLAG:
+    if has_more and not header.flags & _EXTENSIONS_FLAG:
         raise HyrfDataError(
-            f"{name}: the file continues after its {count:,} Gaussians",
+            f"{name}: the file continues after its {header.gaussians:,} Gaussians",
             fix="the file is damaged, export it again",
         )
     ends = np.cumsum([0, *lengths])
-    sections = [content[start:end] for start, end in zip(ends[:-1], ends[1:], strict=True)]
-    return version, degree, bits, flags, sections
+    return header, [content[start:end] for start, end in zip(ends[:-1], ends[1:], strict=True)]
 
 
-def _read_streams(data: bytes, name: str) -> _UnpackedFile:
+def _read_streams(data: bytes, name: str) -> tuple[_Header, list[bytes]]:
     """Read the sections of a file of version 4."""
     if len(data) < _HEADER_STRUCT.size + _TABLE_OFFSET_STRUCT.size:
         raise HyrfDataError(f"{name}: the file ends within its header", fix="the file is truncated, export it again")
-    version, count, degree, bits, flags = _read_header(data[: _HEADER_STRUCT.size], range(4, 5), len(data), name)
-    streams = data[_HEADER_STRUCT.size - 1]
-    (table,) = _TABLE_OFFSET_STRUCT.unpack_from(data, _HEADER_STRUCT.size)
-    lengths = _section_lengths(version, count, degree)
-    if streams != sum(length > 0 for length in lengths):
+    header = _read_header(data[: _HEADER_STRUCT.size], range(4, 5), len(data), name)
+    stream_count = data[_HEADER_STRUCT.size - 1]
+    (table_offset,) = _TABLE_OFFSET_STRUCT.unpack_from(data, _HEADER_STRUCT.size)
+    lengths = header.section_lengths
+    if stream_count != sum(length > 0 for length in lengths):
         raise HyrfDataError(
-            f"{name}: {streams} streams do not fit harmonics of degree {degree} and {count:,} Gaussians",
+            f"{name}: {stream_count} streams do not fit harmonics of degree {header.degree} and {header.gaussians:,} "
+            "Gaussians",
             fix="the file is damaged, export it again",
         )
-    place = table + streams * _STREAM_LENGTHS_STRUCT.size
-    if table < _HEADER_STRUCT.size + _TABLE_OFFSET_STRUCT.size or place > len(data):
+    offset = table_offset + stream_count * _STREAM_LENGTHS_STRUCT.size
+    if table_offset < _HEADER_STRUCT.size + _TABLE_OFFSET_STRUCT.size or offset > len(data):
         raise HyrfDataError(
             f"{name}: its table of contents lies outside of the file",
             fix="the file is damaged or truncated, export it again",
         )
-    sections, entries = [], _STREAM_LENGTHS_STRUCT.iter_unpack(data[table:place])
+    sections, entries = [], _STREAM_LENGTHS_STRUCT.iter_unpack(data[table_offset:offset])
     for length in lengths:
         stored, raw = next(entries) if length else (0, 0)
         if raw != length:
             raise HyrfDataError(
-                f"{name}: a stream has {raw:,} bytes, but {count:,} Gaussians need {length:,}",
+                f"{name}: a stream has {raw:,} bytes, but {header.gaussians:,} Gaussians need {length:,}",
                 fix="the file is damaged, export it again",
             )
-        if stored > len(data) - place:
+        if stored > len(data) - offset:
             raise HyrfDataError(
-                f"{name}: the file ends before its {count:,} Gaussians do",
+                f"{name}: the file ends before its {header.gaussians:,} Gaussians do",
                 fix="the file is truncated, export it again",
             )
-        sections.append(_decompress_zstd(data[place : place + stored], length, name))
-        place += stored
-    return version, degree, bits, flags, sections
+        sections.append(_decompress_zstd(data[offset : offset + stored], length, name))
+        offset += stored
+    return header, sections
 
 
 def _decompress_zstd(stream: bytes, length: int, name: str) -> bytes:
@@ -405,6 +416,6 @@ def _pack_harmonics(harmonics: np.ndarray) -> np.ndarray:
     return np.clip(values, 0, 255, out=values).astype(np.uint8)
 
 
-def _harmonics_signs(degree: int) -> np.ndarray:
+def _compute_harmonics_signs(degree: int) -> np.ndarray:
     """Return the sign (K,), 1 or -1, by which the half turn about x multiplies each harmonic."""
-    return np.rint(np.diagonal(harmonics_rotation(np.diag(_AXIS_SIGNS), degree)))
+    return np.rint(np.diagonal(compute_harmonics_rotation(np.diag(_AXIS_SIGNS), degree)))

@@ -27,9 +27,9 @@ from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.placement import (
     apply_transform,
+    choose_local_origin,
     decompose_similarity,
-    local_origin,
-    local_positions,
+    subtract_origin,
     upright_rotation,
 )
 from hyrfpack.splats.splats import Splats
@@ -149,8 +149,8 @@ def _add_transform(prim: UsdGeom.Xformable, rotation: np.ndarray, translation: n
 def _add_splats(stage: Usd.Stage, splats: Splats) -> None:
     from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
 
-    origin = local_origin(splats.positions)
-    positions = local_positions(splats, origin)
+    origin = choose_local_origin(splats.positions)
+    positions = subtract_origin(splats, origin)
     scales = np.maximum(splats.scales, np.finfo(np.float32).tiny)
     field = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/World/Gaussians")
     _add_transform(field, np.eye(3), origin)
@@ -198,8 +198,10 @@ def _add_camera(stage: Usd.Stage, camera: Camera, splats: Splats) -> None:
     depths = (splats.positions - camera.position) @ camera.forward
     reach = np.linalg.norm(splats.positions - camera.position, axis=1) + 3 * splats.scales.max(axis=1)
     if (depths > 0).any():
-        near = _NEAR_MEDIAN_DEPTH_RATIO * float(np.median(depths[depths > 0]))
-        prim.CreateClippingRangeAttr(Gf.Vec2f(near, max(_FAR_MAX_REACH_RATIO * float(reach.max()), 2 * near)))
+        near_plane = _NEAR_MEDIAN_DEPTH_RATIO * float(np.median(depths[depths > 0]))
+        prim.CreateClippingRangeAttr(
+            Gf.Vec2f(near_plane, max(_FAR_MAX_REACH_RATIO * float(reach.max()), 2 * near_plane))
+        )
 
 
 def _pack_usdz(binary: bytes, name: str) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.splats.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalize_quats
 
 
 def build_valid_splats(
@@ -36,13 +36,19 @@ def build_valid_splats(
         scales, quats, opacities, harmonics = (
             np.asarray(values, np.float32) for values in (scales, quats, opacities, harmonics)
         )
-    named = {"position": positions, "scale": scales, "rotation": quats, "opacity": opacities, "colour": harmonics}
-    for part, values in named.items():
+    values_by_part = {
+        "position": positions,
+        "scale": scales,
+        "rotation": quats,
+        "opacity": opacities,
+        "colour": harmonics,
+    }
+    for part, values in values_by_part.items():
         if not np.isfinite(values).all():
-            bad = int(np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))[0])
+            index = int(np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))[0])
             raise HyrfDataError(
-                f"{name}: the {part} of Gaussian {bad:,} of {len(values):,} is not a finite number, because the file "
+                f"{name}: the {part} of Gaussian {index:,} of {len(values):,} is not a finite number, because the file "
                 "is damaged or its training failed",
                 fix="export it again",
             )
-    return Splats(positions, scales, normalized_quats(quats), opacities, harmonics, antialiased)
+    return Splats(positions, scales, normalize_quats(quats), opacities, harmonics, antialiased)

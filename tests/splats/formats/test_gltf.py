@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats import gltf
 from hyrfpack.splats.formats.hints import Hints
-from hyrfpack.splats.placement import local_origin, upright_rotation
+from hyrfpack.splats.placement import choose_local_origin, upright_rotation
 from hyrfpack.splats.splats import Splats
 
 Y_DOWN, Z_UP = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -116,7 +116,7 @@ def test_a_scene_far_away_keeps_its_precision():
     data = gltf.encode(splats, Hints(Z_UP))
     np.testing.assert_allclose(gltf.decode(data, "a.glb").positions, splats.positions, rtol=0, atol=1e-6)
     assert np.abs(parse_json(data)["accessors"][0]["max"]).max() < 8
-    assert not local_origin(random_splats(100, shift=(2, 2, 2)).positions).any()
+    assert not choose_local_origin(random_splats(100, shift=(2, 2, 2)).positions).any()
 
 
 def test_normalized_integers_strides_and_matrices_are_read():

@@ -13,7 +13,7 @@ from made_up_splats import FILE_EDITS, KEPT_FRACTIONS, damage_file
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats import ply
-from hyrfpack.splats.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalize_quats
 
 PROPERTY_NAMES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3))]
 PROPERTY_NAMES += [f"rot_{i}" for i in range(4)]
@@ -24,7 +24,7 @@ def make_splats(count: int, degree: int = 3) -> Splats:
     return Splats(
         rng.normal(0, 5, (count, 3)).astype(np.float32),
         np.exp(rng.normal(-3, 2, (count, 3))),
-        normalized_quats(rng.normal(size=(count, 4))),
+        normalize_quats(rng.normal(size=(count, 4))),
         rng.uniform(0, 1, count),
         rng.normal(size=(count, (degree + 1) ** 2, 3)),
     )

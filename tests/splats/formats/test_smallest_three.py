@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from hyrfpack.splats.formats.smallest_three import drop_largest, restore_largest
-from hyrfpack.splats.splats import normalized_quats
+from hyrfpack.splats.splats import normalize_quats
 
 
 @pytest.mark.parametrize("largest", range(4))
@@ -15,7 +15,7 @@ def test_the_largest_component_is_omitted_and_made_positive(largest, sign):
 
 
 def test_rotations_round_trip_with_the_precision_of_the_bits():
-    quats = normalized_quats(np.random.default_rng(0).normal(size=(1000, 4)))
+    quats = normalize_quats(np.random.default_rng(0).normal(size=(1000, 4)))
     largest, others = drop_largest(quats)
     back = restore_largest(largest, others)
     assert back.dtype == np.float32 and np.abs(others).max() <= 0.5**0.5 + 1e-7

@@ -20,7 +20,7 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.ops.harmonics import num_sh_bases
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.palette import build_palette, find_nearest_entries
-from hyrfpack.splats.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalize_quats
 
 
 def random_splats(count: int, degree: int = 3) -> Splats:
@@ -29,7 +29,7 @@ def random_splats(count: int, degree: int = 3) -> Splats:
     return Splats(
         rng.standard_cauchy((count, 3)),
         np.exp(rng.normal(-4, 1, (count, 3))),
-        normalized_quats(rng.normal(size=(count, 4))),
+        normalize_quats(rng.normal(size=(count, 4))),
         np.clip(rng.normal(0.5, 0.5, count), 0, 1),
         rng.normal(0, 0.3, (count, num_sh_bases(degree), 3)),
     )
@@ -90,7 +90,7 @@ def test_a_sog_of_splat_transform_equals_its_ply(shared_data: Path) -> None:
     higher = columns("f_rest", 24).reshape(-1, 3, 8).transpose(0, 2, 1)
     np.testing.assert_allclose(splats.positions, np.stack([table[axis] for axis in "xyz"], 1), atol=1e-6)
     np.testing.assert_allclose(np.log(splats.scales), columns("scale", 3), atol=1e-5)
-    np.testing.assert_allclose(splats.quats, normalized_quats(columns("rot", 4)), atol=1e-5)
+    np.testing.assert_allclose(splats.quats, normalize_quats(columns("rot", 4)), atol=1e-5)
     np.testing.assert_allclose(splats.opacities, 1 / (1 + np.exp(-table["opacity"])), atol=2e-6)
     np.testing.assert_array_equal(splats.harmonics, np.concatenate((columns("f_dc", 3)[:, None], higher), 1))
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats.formats import splat
-from hyrfpack.splats.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalize_quats
 
 BAND_0_VALUE = 0.5 / np.sqrt(np.pi)
 
@@ -21,7 +21,7 @@ def make_splats(count: int) -> Splats:
     return Splats(
         rng.normal(0, 5, (count, 3)).astype(np.float32),
         np.exp(rng.normal(-3, 1, (count, 3))),
-        normalized_quats(rng.normal(size=(count, 4))),
+        normalize_quats(rng.normal(size=(count, 4))),
         rng.uniform(0, 1, count),
         rng.uniform(-1.7, 1.7, (count, 4, 3)),
     )

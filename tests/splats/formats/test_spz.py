@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.splats.formats import compressed_ply, spz
 from hyrfpack.splats.formats.hints import Hints
-from hyrfpack.splats.splats import Splats, normalized_quats
+from hyrfpack.splats.splats import Splats, normalize_quats
 
 # A half turn about x changes the sign of the harmonics that are odd in (y, z).
 HALF_TURN_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1])
@@ -28,7 +28,7 @@ def make_splats(count: int, degree: int = 3, antialiased: bool = False) -> Splat
     return Splats(
         rng.normal(0, 5, (count, 3)),
         np.exp(rng.normal(-3, 1, (count, 3))),
-        normalized_quats(rng.normal(size=(count, 4))),
+        normalize_quats(rng.normal(size=(count, 4))),
         rng.uniform(0, 1, count),
         rng.uniform(-0.95, 0.95, (count, (degree + 1) ** 2, 3)),
         antialiased,

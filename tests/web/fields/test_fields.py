@@ -16,7 +16,7 @@ from hyrfpack.model.residuals import add_color_residuals
 from hyrfpack.ops.background.reference import BACKGROUND_RADIUS
 from hyrfpack.ops.contraction import contract
 from hyrfpack.ops.shade import encode_directions
-from hyrfpack.splats.splats import normalized_quats
+from hyrfpack.splats.splats import normalize_quats
 from tools.safety.make_golden import add_golden_residuals
 
 EVALUATE_SCRIPT = Path(__file__).parent / "evaluate.mjs"
@@ -125,4 +125,4 @@ def test_a_zero_quaternion_becomes_the_identity(tmp_path: Path) -> None:
         model, tmp_path, random_directions(4, 1), random_directions(1, 2), random_directions(1, 2)
     )[2]
 
-    np.testing.assert_array_equal(quats, normalized_quats(np.zeros((4, 4))))
+    np.testing.assert_array_equal(quats, normalize_quats(np.zeros((4, 4))))
