@@ -60,7 +60,7 @@ class EncodingCase:
 
 
 @torch.no_grad()
-def codec_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
+def measure_codec(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
     """Measure encoding and decoding with every profile, and with other values of each of its settings.
 
     Args:
@@ -79,58 +79,58 @@ def codec_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row
             cases += _encoding_cases(subject, profile)
         except HyrfError as error:
             notes.append(f"profile '{profile}' is left out: {error}")
-    names = {f"{case.setting} {case.value}": case for case in cases}
-    encoding, files = time_alternately({name: case.encode for name, case in names.items()}, repeats)
+    cases_by_name = {f"{case.setting} {case.value}": case for case in cases}
+    encoding, files = time_alternately({name: case.encode for name, case in cases_by_name.items()}, repeats)
     decoding, models = time_alternately({name: partial(decode_model, data) for name, data in files.items()}, repeats)
 
-    exact, first = _render_views(subject, subject.model), f"profile {REFERENCE_PROFILE}"
-    best = subject.scores(exact, exact)
-    for name, case in names.items():
+    exact, reference_name = _render_views(subject, subject.model), f"profile {REFERENCE_PROFILE}"
+    exact_scores = subject.measure_scores(exact, exact)
+    for name, case in cases_by_name.items():
         pictures = _render_views(subject, models[name])
         yield Row(
             group="codec",
             setting=case.setting,
             value=case.value,
-            is_reference=name == first,
+            is_reference=name == reference_name,
             is_default=case.is_default,
             time=encoding[name],
-            ratio=encoding[name].ratio_to(encoding[first]),
-            parts=parameter_errors(subject.model, models[name]),
+            ratio=encoding[name].ratio_to(encoding[reference_name]),
+            parts=measure_parameter_errors(subject.model, models[name]),
             bytes=len(files[name]),
             decode=decoding[name],
-            decode_ratio=decoding[name].ratio_to(decoding[first]),
-            **subject.losses(pictures, exact, best, f"codec, {name}"),
+            decode_ratio=decoding[name].ratio_to(decoding[reference_name]),
+            **subject.measure_losses(pictures, exact, exact_scores, f"codec, {name}"),
         )
 
 
-def parameter_errors(before: HybridModel, after: HybridModel) -> dict[str, Error]:
+def measure_parameter_errors(reference: HybridModel, candidate: HybridModel) -> dict[str, Error]:
     """Compute the absolute errors of each group of parameters, by the group's description in SECTIONS.
 
     Positions are compared in local units, other parameters as stored. If a profile changes the order of the Gaussians,
     each is compared with the most similar one. If it changes their number, their parameters are left out.
     """
-    old, new = to_arrays(before), to_arrays(after)
-    if len(before) == len(after):
-        order = _match_gaussians(old, new)
-        new |= {group: new[group][order] for group in layered_groups(before.config)}
+    expected, measured = to_arrays(reference), to_arrays(candidate)
+    if len(reference) == len(candidate):
+        order = _match_gaussians(expected, measured)
+        measured |= {group: measured[group][order] for group in layered_groups(reference.config)}
     return {
         SECTION_CONTENTS[group]: measure_error(
-            torch.from_numpy(new[group]), torch.from_numpy(values), SECTION_CONTENTS[group]
+            torch.from_numpy(measured[group]), torch.from_numpy(values), SECTION_CONTENTS[group]
         )
-        for group, values in old.items()
-        if values.shape == new[group].shape
+        for group, values in expected.items()
+        if values.shape == measured[group].shape
     }
 
 
-def _match_gaussians(old: dict[str, np.ndarray], new: dict[str, np.ndarray]) -> np.ndarray:
+def _match_gaussians(expected: dict[str, np.ndarray], measured: dict[str, np.ndarray]) -> np.ndarray:
     """Return the (N,) index of the new Gaussian that corresponds to each old one."""
-    count = len(old[POSITIONS])
-    spread = np.linalg.norm(old[POSITIONS] - np.median(old[POSITIONS], axis=0), axis=1)
-    moved = np.linalg.norm(new[POSITIONS] - old[POSITIONS], axis=1)
+    count = len(expected[POSITIONS])
+    spread = np.linalg.norm(expected[POSITIONS] - np.median(expected[POSITIONS], axis=0), axis=1)
+    moved = np.linalg.norm(measured[POSITIONS] - expected[POSITIONS], axis=1)
     if np.median(moved) <= 0.01 * np.median(spread):
         return np.arange(count)
     # All parameters are compared, because Gaussians may share a position. Each column is scaled by its deviation.
-    rows = [np.concatenate([arrays[group] for group in LAYERED_SECTIONS], axis=1) for arrays in (old, new)]
+    rows = [np.concatenate([arrays[group] for group in LAYERED_SECTIONS], axis=1) for arrays in (expected, measured)]
     size = rows[0].std(axis=0) + 1e-12
     return cKDTree(rows[1] / size).query(rows[0] / size)[1]
 
@@ -141,15 +141,15 @@ def _encoding_cases(subject: Subject, profile: str) -> Iterator[EncodingCase]:
         encode, defaults = _compact_encoder(subject)
     else:
         encode, defaults = _encoder(subject, profile)
-    itself = EncodingCase("profile", profile, profile == CompressConfig.profile, encode)
-    yield itself
+    default_case = EncodingCase("profile", profile, profile == CompressConfig.profile, encode)
+    yield default_case
     for name, values in PROFILE_SETTING_VALUES.get(profile, {}).items():
         default = defaults[name]
         if name == "distortion":
             values = tuple(default * factor for factor in values)
         for value in sorted({*values, default}):
             if value == default:
-                yield replace(itself, setting=f"{profile}, {name}", value=_format_value(value), is_default=True)
+                yield replace(default_case, setting=f"{profile}, {name}", value=_format_value(value), is_default=True)
             else:
                 yield EncodingCase(f"{profile}, {name}", _format_value(value), False, partial(encode, **{name: value}))
 

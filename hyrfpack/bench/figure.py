@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from hyrfpack.bench.rows import Row
 from hyrfpack.errors import HyrfError
-from hyrfpack.evaluate.figures import blank_figure, save_figure
+from hyrfpack.evaluate.figures import make_blank_figure, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -64,9 +64,9 @@ def plot(rows: Sequence[Row], path: str | os.PathLike[str], *, overwrite: bool =
     """
     panels = build_panels(rows)
     columns = min(MAX_PANEL_COLUMNS, len(panels))
-    lines = -(-len(panels) // columns)
-    figure = blank_figure(5.2 * columns, 4.2 * lines)
-    all_axes = list(figure.subplots(lines, columns, squeeze=False).flat)
+    panel_rows = -(-len(panels) // columns)
+    figure = make_blank_figure(5.2 * columns, 4.2 * panel_rows)
+    all_axes = list(figure.subplots(panel_rows, columns, squeeze=False).flat)
     labels_by_panel = [_draw_panel(axes, panel) for axes, panel in zip(all_axes, panels, strict=False)]
     for axes in all_axes[len(panels) :]:
         axes.set_axis_off()
@@ -74,10 +74,10 @@ def plot(rows: Sequence[Row], path: str | os.PathLike[str], *, overwrite: bool =
     figure.set_layout_engine("none")
     for axes, labels in zip(all_axes, labels_by_panel, strict=False):
         _draw_labels(axes, labels)
-    return save_figure(path, figure, overwrite=overwrite, format=plot_format(path))
+    return save_figure(path, figure, overwrite=overwrite, format=choose_plot_format(path))
 
 
-def plot_format(path: str | os.PathLike[str]) -> str:
+def choose_plot_format(path: str | os.PathLike[str]) -> str:
     """Return the format that a path's extension names.
 
     Raises:
@@ -98,7 +98,7 @@ def build_panels(rows: Sequence[Row]) -> list[Panel]:
     for row in rows:
         title = row.group
         if row.group == "render":
-            values = sum((other.group, other.setting) == ("render", row.setting) for other in rows)
+            values = sum((candidate.group, candidate.setting) == ("render", row.setting) for candidate in rows)
             title = f"render: {row.setting}" if values > 2 else "render: other settings"
         elif row.group == "codec":
             title = f"codec: {row.setting.partition(',')[0]}"
@@ -167,15 +167,15 @@ def _draw_labels(axes: Axes, labels: Sequence[tuple[Row, float, float, str]]) ->
     """Write the values at their points if there is room; references and defaults are placed first."""
     scale = axes.figure.dpi / 72
     edge = axes.bbox.x1 / scale
-    taken: list[Box] = []
+    placed_boxes: list[Box] = []
     for row, x, y, color in sorted(labels, key=lambda item: not (item[0].is_reference or item[0].is_default)):
         left, bottom = axes.transData.transform((x, y)) / scale
         width = 0.58 * LABEL_SIZE_POINTS * len(row.value)
         for right, up in LABEL_OFFSETS_POINTS:
             start = left + right - (width if right < 0 else 0)
             box = (start, bottom + up, start + width, bottom + up + LABEL_SIZE_POINTS)
-            if box[2] <= edge and not any(_overlap(box, other) for other in taken):
-                taken.append(box)
+            if box[2] <= edge and not any(_overlap(box, placed) for placed in placed_boxes):
+                placed_boxes.append(box)
                 axes.annotate(
                     row.value,
                     (x, y),

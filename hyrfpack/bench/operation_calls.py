@@ -69,7 +69,7 @@ class OperationCall:
             with torch.enable_grad():
                 values = run()
             if upstream is None:  # This is so only in the first run, which is not timed.
-                upstream = random_cotangent(values)
+                upstream = make_random_cotangent(values)
             return values.detach(), torch.autograd.grad(values, leaves, upstream)
 
         return task
@@ -83,7 +83,7 @@ class OperationCall:
         """
         run, leaves = self._bind(*options)
         values = run()
-        upstream = random_cotangent(values) if upstream is None else upstream.to(values.dtype)
+        upstream = make_random_cotangent(values) if upstream is None else upstream.to(values.dtype)
         return run, lambda: torch.autograd.grad(values, leaves, upstream, retain_graph=True)
 
     def _bind(
@@ -98,13 +98,13 @@ class OperationCall:
         return partial(self.run, implementation, **copies), leaves
 
 
-def random_cotangent(values: Tensor) -> Tensor:
+def make_random_cotangent(values: Tensor) -> Tensor:
     """Return a random upstream gradient for `values`; it has the same numbers in every precision."""
     generator = torch.Generator().manual_seed(1)
     return torch.randn(values.shape, generator=generator).to(values.device, values.dtype)
 
 
-def rasterize_call(
+def make_rasterize_call(
     inputs: Mapping[str, Tensor],
     viewport: Viewport,
     settings: RasterSettings = RasterSettings(),  # noqa: B008 - frozen
@@ -112,7 +112,7 @@ def rasterize_call(
     """Return the call of `rasterize`; its values are (H, W, 4) colours and transmittance.
 
     Args:
-        inputs: the Gaussians' tensors by name, see `splat_inputs`.
+        inputs: the Gaussians' tensors by name, see `collect_splat_inputs`.
         viewport, settings: as in `rasterize`.
     """
 
@@ -125,12 +125,12 @@ def rasterize_call(
     return OperationCall(draw, inputs, tuple(inputs), (1e-3, 1e-2))
 
 
-def join_color_and_transmittance(drawn: Rasterization) -> Tensor:
+def join_color_and_transmittance(rasterization: Rasterization) -> Tensor:
     """Return (H, W, 4) colours and transmittance."""
-    return torch.cat((drawn.rgb, drawn.transmittance[..., None]), dim=-1)
+    return torch.cat((rasterization.rgb, rasterization.transmittance[..., None]), dim=-1)
 
 
-def hash_encode_call(
+def make_hash_encode_call(
     coords: Tensor,
     table: Tensor,
     resolutions: tuple[int, ...],
@@ -146,7 +146,7 @@ def hash_encode_call(
     return OperationCall(look_up, {"coords": coords, "table": table}, gradient_inputs)
 
 
-def mlp_call(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], mixed: bool = False) -> OperationCall:
+def make_mlp_call(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], mixed: bool = False) -> OperationCall:
     """Return the call of `mlp` on the rows of x, with the gradients of all inputs."""
     layers = len(weights)
 
@@ -161,7 +161,7 @@ def mlp_call(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], mix
     return OperationCall(decode, inputs, tuple(inputs), (3e-3, 1e-2) if mixed else (1e-4, 1e-3))
 
 
-def loss_call(image: Tensor, target: Tensor, mask: Tensor | None = None) -> OperationCall:
+def make_loss_call(image: Tensor, target: Tensor, mask: Tensor | None = None) -> OperationCall:
     """Return the call of the photometric loss of an image, with the gradient of the image."""
 
     def loss(implementation: str, image: Tensor, target: Tensor) -> Tensor:
@@ -171,7 +171,7 @@ def loss_call(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Oper
 
 
 @torch.no_grad()
-def splat_inputs(model: HybridModel, viewpoint: Tensor) -> dict[str, Tensor]:
+def collect_splat_inputs(model: HybridModel, viewpoint: Tensor) -> dict[str, Tensor]:
     """Return the tensors of `Gaussians3D` and the colours by name, in this order, for all Gaussians of a model.
 
     The colours are those seen from a point (3,) in local units.
@@ -181,18 +181,18 @@ def splat_inputs(model: HybridModel, viewpoint: Tensor) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def decoder_inputs(model: HybridModel, viewpoint: Tensor) -> Iterator[tuple[str, Field, Tensor]]:
+def iterate_decoder_inputs(model: HybridModel, viewpoint: Tensor) -> Iterator[tuple[str, Field, Tensor]]:
     """Yield the name of each field, the field, and the inputs (N, inputs) of its decoder for all Gaussians.
 
     The Gaussians are seen from `viewpoint` (3,) in local units.
     """
     positions = model.gaussians.positions.detach()
-    seen = encode_views(positions, viewpoint.to(positions), model.config.direction_encoding)
-    extra = {"geometry": None, "radiance": seen}
-    for name, field in named_fields(model):
-        yield name, field, field.features(model.cube_coords(positions), extra[name])
+    encoded_views = encode_views(positions, viewpoint.to(positions), model.config.direction_encoding)
+    extra_inputs = {"geometry": None, "radiance": encoded_views}
+    for name, field in list_named_fields(model):
+        yield name, field, field.features(model.cube_coords(positions), extra_inputs[name])
 
 
-def named_fields(model: HybridModel) -> list[tuple[str, Field]]:
+def list_named_fields(model: HybridModel) -> list[tuple[str, Field]]:
     """Return both fields with their names."""
     return [("geometry", model.geometry), ("radiance", model.radiance)]

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from hyrfpack.bench.operation_calls import (
     OperationCall,
-    decoder_inputs,
-    hash_encode_call,
-    mlp_call,
-    named_fields,
-    rasterize_call,
-    splat_inputs,
+    collect_splat_inputs,
+    iterate_decoder_inputs,
+    list_named_fields,
+    make_hash_encode_call,
+    make_mlp_call,
+    make_rasterize_call,
 )
 from hyrfpack.bench.rows import Row
 from hyrfpack.bench.subject import Subject
@@ -59,30 +59,30 @@ MLP_VARIANTS = (*RASTERIZE_VARIANTS, Variant("bfloat16 reference", "reference", 
 DEFAULT_VARIANT = "cpu"
 
 
-def rasterize_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
+def measure_rasterize(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
     """Measure the rasterisation of one view, with and without antialiasing, forward and with all gradients."""
     model, viewport = _middle_view(subject)
-    inputs = splat_inputs(model, camera_center(viewport.pose))
+    inputs = collect_splat_inputs(model, camera_center(viewport.pose))
     for antialiased in (False, True):
-        call = rasterize_call(inputs, viewport, RasterSettings(antialiased=antialiased))
+        call = make_rasterize_call(inputs, viewport, RasterSettings(antialiased=antialiased))
         name = "antialiased, " if antialiased else ""
         yield from _compare("rasterize", name, call, RASTERIZE_VARIANTS, measure_error, repeats)
 
 
-def hash_encode_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
+def measure_hash_encode(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
     """Measure the lookup of both fields' features at all Gaussians, with gradients of the table, as in training."""
     coords = subject.model.cube_coords(subject.model.gaussians.positions)
-    for name, part in named_fields(subject.model):
+    for name, part in list_named_fields(subject.model):
         grid = part.grid.config
-        call = hash_encode_call(coords, part.grid.table, grid.resolutions, grid.log2_table_size)
+        call = make_hash_encode_call(coords, part.grid.table, grid.resolutions, grid.log2_table_size)
         yield from _compare("hash_encode", f"{name}, ", call, HASH_ENCODE_VARIANTS, measure_relative_error, repeats)
 
 
-def mlp_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
+def measure_mlp(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
     """Measure both fields' decoders on the features of all Gaussians, seen from one camera."""
     model, viewport = _middle_view(subject)
-    for name, part, features in decoder_inputs(model, camera_center(viewport.pose)):
-        call = mlp_call(features, list(part.weights), list(part.biases))
+    for name, part, features in iterate_decoder_inputs(model, camera_center(viewport.pose)):
+        call = make_mlp_call(features, list(part.weights), list(part.biases))
         yield from _compare("mlp", f"{name}, ", call, MLP_VARIANTS, measure_relative_error, repeats)
 
 
@@ -102,7 +102,7 @@ def _compare(
 ) -> Iterator[Row]:
     """Yield the rows of one operation, forward only and with gradients; all variants are timed in turns."""
     for setting, make in (("forward", call.forward_task), ("forward + backward", call.forward_backward_task)):
-        tasks = {one.name: make(one.implementation, one.dtype, one.dtypes) for one in variants}
+        tasks = {variant.name: make(variant.implementation, variant.dtype, variant.dtypes) for variant in variants}
         for variant in variants:
             if variant.implementation == "cpu":
                 tasks[variant.name]()  # compiles kernels that are not cached, which must not count as a slow first run

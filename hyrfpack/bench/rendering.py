@@ -33,7 +33,7 @@ RenderTask = Callable[[], list[Tensor]]
 
 
 @torch.no_grad()
-def render_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
+def measure_renderer(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Row]:
     """Measure the values of one setting at a time with the defaults of all others, then all settings together.
 
     The reference of a setting has its exact value. So the difference in time is what this setting saves, and the error
@@ -52,16 +52,18 @@ def render_rows(subject: Subject, repeats: int, notes: list[str]) -> Iterator[Ro
             notes.append(f"the model has no background sphere, so {name} is left out")
             continue
         default = getattr(defaults, name)
-        exact, others = values[0], list(dict.fromkeys((*values[1:], default)))
-        tasks = {format_value(value): render_task(replace(defaults, **{name: value})) for value in (exact, *others)}
+        exact, other_values = values[0], list(dict.fromkeys((*values[1:], default)))
+        tasks = {
+            format_value(value): render_task(replace(defaults, **{name: value})) for value in (exact, *other_values)
+        }
         yield from _compare(subject, name, tasks, format_value(default), repeats)
     tasks = {"for each view": render_task(defaults, reuse_decoded=False), "once": render_task(defaults)}
     yield from _compare(subject, "decoding", tasks, "once", repeats)
-    other = copy.copy(model)
-    other.config = replace(model.config, antialiased=not model.config.antialiased)
-    words = ["on" if one.config.antialiased else "off" for one in (model, other)]
-    tasks = {words[0]: render_task(defaults), words[1]: render_task(defaults, other)}
-    yield from _compare(subject, "antialiased", tasks, words[0], repeats)
+    toggled = copy.copy(model)
+    toggled.config = replace(model.config, antialiased=not model.config.antialiased)
+    states = ["on" if candidate.config.antialiased else "off" for candidate in (model, toggled)]
+    tasks = {states[0]: render_task(defaults), states[1]: render_task(defaults, toggled)}
+    yield from _compare(subject, "antialiased", tasks, states[0], repeats)
     tasks = {"exact": render_task(EXACT_SETTINGS), "defaults": render_task(defaults)}
     yield from _compare(subject, "all", tasks, "defaults", repeats)
 
@@ -72,7 +74,7 @@ def _compare(subject: Subject, setting: str, tasks: dict[str, RenderTask], defau
     times = {value: time.per_part(len(subject.cameras)) for value, time in times.items()}
     reference = next(iter(tasks))
     exact = results[reference]
-    best = subject.scores(exact, exact)
+    exact_scores = subject.measure_scores(exact, exact)
     for value, pictures in results.items():
         yield Row(
             group="render",
@@ -82,5 +84,5 @@ def _compare(subject: Subject, setting: str, tasks: dict[str, RenderTask], defau
             is_default=value == default,
             time=times[value],
             ratio=times[value].ratio_to(times[reference]),
-            **subject.losses(pictures, exact, best, f"render, {setting} {value}"),
+            **subject.measure_losses(pictures, exact, exact_scores, f"render, {setting} {value}"),
         )

@@ -67,36 +67,36 @@ class Subject:
     provenance: dict[str, Any] = field(default_factory=dict)
     scene: Scene | None = None
 
-    def scores(self, pictures: Sequence[Tensor], exact: Sequence[Tensor]) -> tuple[float, float]:
-        """Compute the mean PSNR and SSIM over views, against the photos, or without photos against `exact`."""
-        against = self.photos or [(to_8bit(picture), None) for picture in exact]
+    def measure_scores(self, pictures: Sequence[Tensor], exact: Sequence[Tensor]) -> tuple[float, float]:
+        """Measure the mean PSNR and SSIM over views, against the photos, or without photos against `exact`."""
+        references = self.photos or [(to_8bit(picture), None) for picture in exact]
         images = [to_8bit(picture) for picture in pictures]
-        pairs = [(image, *photo) for image, photo in zip(images, against, strict=True)]
+        pairs = [(image, *photo) for image, photo in zip(images, references, strict=True)]
         return fmean(psnr(*pair) for pair in pairs), fmean(ssim(*pair) for pair in pairs)
 
-    def losses(
-        self, pictures: Sequence[Tensor], exact: Sequence[Tensor], best: tuple[float, float], what: str
+    def measure_losses(
+        self, pictures: Sequence[Tensor], exact: Sequence[Tensor], exact_scores: tuple[float, float], what: str
     ) -> dict[str, Any]:
-        """Compute the fields of a `Row` about pictures: the error, the scores and, with photos, their drops.
+        """Measure the fields of a `Row` about pictures: the error, the scores and, with photos, their drops.
 
         Args:
             pictures: (H, W, 3) picture of each camera.
             exact: the reference's pictures.
-            best: `scores` of `exact`.
+            exact_scores: `measure_scores` of `exact`.
             what: what is measured, for the error message.
 
         Raises:
             HyrfError: a picture holds NaN or infinity.
         """
-        psnr, ssim = self.scores(pictures, exact)
-        measured, expected = (torch.cat([picture.flatten() for picture in many]) for many in (pictures, exact))
-        drops = {"psnr_drop": best[0] - psnr, "ssim_drop": best[1] - ssim} if self.photos else {}
+        psnr, ssim = self.measure_scores(pictures, exact)
+        measured, expected = (torch.cat([picture.flatten() for picture in images]) for images in (pictures, exact))
+        drops = {"psnr_drop": exact_scores[0] - psnr, "ssim_drop": exact_scores[1] - ssim} if self.photos else {}
         return {"error": measure_error(measured, expected, what), "psnr": psnr, "ssim": ssim, **drops}
 
     def describe(self) -> str:
         """Describe the model, and what quality is measured against, in one sentence."""
         camera = self.cameras[0]
-        against = (
+        quality = (
             f"quality against {format_count(len(self.photos), 'held-out photo')}"
             if self.photos
             else f"quality against exact renders of the model from {len(self.cameras)} viewpoints around the scene"
@@ -104,7 +104,7 @@ class Subject:
         return (
             f"{self.name}: {format_count(len(self.model), 'Gaussian')}, "
             f"{'a' if self.model.config.background else 'no'} background sphere, "
-            f"views of {camera.width} x {camera.height}, {against}"
+            f"views of {camera.width} x {camera.height}, {quality}"
         )
 
 
@@ -140,7 +140,7 @@ def read_subject(path: str | os.PathLike[str], scene: Scene | None) -> Subject:
     )
 
 
-def built_in_subject() -> Subject:
+def train_built_in_subject() -> Subject:
     """Train a small model on the demo's scene in a temporary folder.
 
     It trains on the CPU, also beside a GPU, so that the result is the same every time.

@@ -7,11 +7,11 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 
-from hyrfpack.bench.codec import codec_rows
-from hyrfpack.bench.operations import hash_encode_rows, mlp_rows, rasterize_rows
-from hyrfpack.bench.rendering import render_rows
+from hyrfpack.bench.codec import measure_codec
+from hyrfpack.bench.operations import measure_hash_encode, measure_mlp, measure_rasterize
+from hyrfpack.bench.rendering import measure_renderer
 from hyrfpack.bench.rows import Row
-from hyrfpack.bench.subject import Subject, built_in_subject, read_subject
+from hyrfpack.bench.subject import Subject, read_subject, train_built_in_subject
 from hyrfpack.checks import check_type
 from hyrfpack.errors import needs_package
 from hyrfpack.measure.machine import describe_machine
@@ -23,11 +23,11 @@ _LOG = logging.getLogger(__name__)
 # Groups in order of measurement. Each function takes a subject, the number of repeats, and a list, to which it appends
 # a sentence for each part that is left out.
 ROW_FUNCTIONS_BY_GROUP: dict[str, Callable[[Subject, int, list[str]], Iterator[Row]]] = {
-    "rasterize": rasterize_rows,
-    "hash_encode": hash_encode_rows,
-    "mlp": mlp_rows,
-    "render": render_rows,
-    "codec": codec_rows,
+    "rasterize": measure_rasterize,
+    "hash_encode": measure_hash_encode,
+    "mlp": measure_mlp,
+    "render": measure_renderer,
+    "codec": measure_codec,
 }
 
 
@@ -96,7 +96,7 @@ def benchmark_model(
         check_type("scene", scene, Scene)
     with needs_package("measuring the compiled kernels"):
         import numba  # noqa: F401 - imported here, so that it fails before the work starts
-    subject = built_in_subject() if model is None else read_subject(model, scene)
+    subject = train_built_in_subject() if model is None else read_subject(model, scene)
     notes: list[str] = []
     rows: list[Row] = []
     for name in ROW_FUNCTIONS_BY_GROUP:

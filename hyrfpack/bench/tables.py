@@ -90,13 +90,13 @@ def fill_page(text: str, blocks: dict[str, str], name: str = "the page") -> str:
     """
     for key, block in blocks.items():
         start = f"<!-- bench {key} -->"
-        place = re.search(f"^{re.escape(start)}\n(.*?)^{BLOCK_END}$", text, re.MULTILINE | re.DOTALL)
-        if place is None:
+        block_match = re.search(f"^{re.escape(start)}\n(.*?)^{BLOCK_END}$", text, re.MULTILINE | re.DOTALL)
+        if block_match is None:
             raise HyrfError(
                 f"{name}: there is no place for {key}",
                 fix=f"add the lines '{start}' and '{BLOCK_END}' to it",
             )
-        text = f"{text[: place.start(1)]}\n{block}\n\n{text[place.end(1) :]}"
+        text = f"{text[: block_match.start(1)]}\n{block}\n\n{text[block_match.end(1) :]}"
     return text
 
 
@@ -108,9 +108,13 @@ def empty_page(blocks: dict[str, str]) -> str:
 def _build_table(title: str, columns: dict[str, Callable[[Row], str]], rows: Sequence[Row]) -> Table:
     """Format the cells of a table and drop columns that are empty in all rows."""
     cells = [[format_cell(row) for format_cell in columns.values()] for row in rows]
-    kept = [number for number in range(len(columns)) if any(line[number] for line in cells)]
+    filled_columns = [number for number in range(len(columns)) if any(line[number] for line in cells)]
     header = list(columns)
-    return Table(title, [header[number] for number in kept], [[line[number] for number in kept] for line in cells])
+    return Table(
+        title,
+        [header[number] for number in filled_columns],
+        [[line[number] for number in filled_columns] for line in cells],
+    )
 
 
 def _format_time(time: Timing) -> str:

@@ -86,15 +86,15 @@ def bench(
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     from hyrfpack.atomic import write_atomic
     from hyrfpack.bench import tables
-    from hyrfpack.bench.figure import plot, plot_format
-    from hyrfpack.bench.suite import benchmark_model as measure
+    from hyrfpack.bench.figure import choose_plot_format, plot
+    from hyrfpack.bench.suite import benchmark_model
     from hyrfpack.evaluate.figures import require_matplotlib
     from hyrfpack.format import describe_file
     from hyrfpack.format.input_folder import find_input_folder
     from hyrfpack.measure.machine import format_machine
 
     model = None if model is None else resolve_model_file(model)
-    plot_format(output)
+    choose_plot_format(output)
     require_matplotlib()
     scene = None if data is None or model is None else read_scene(data, reader_options, describe_file(model))
     folder = None if model is None else find_input_folder(model)
@@ -106,7 +106,7 @@ def bench(
     if markdown is not None:  # an existing page with places is filled, which needs no permission to overwrite
         Outputs(model, folder=folder, scene=scene, overwrite=overwrite or bool(page)).file(markdown)
     with notes_only_of("hyrfpack.bench"):
-        result = measure(model, scene, repeats=repeats, only=only or None)
+        result = benchmark_model(model, scene, repeats=repeats, only=only or None)
     if as_json:
         print_json(result.to_dict())
     else:

@@ -135,9 +135,9 @@ def evaluate_model(
         scorer = ViewScorer(model, settings, perceptual)
         scorer.warm_up(views[0].camera)
         scores: list[tuple[int, ViewScore | None, float]] = []
-        own = ranks.share(list(enumerate(views)))
-        for done, (number, view) in enumerate(own):
-            progress(TaskEvent(f"scoring photo {done + 1}/{len(own)}", done / len(own)))
+        own_views = ranks.share(list(enumerate(views)))
+        for position, (number, view) in enumerate(own_views):
+            progress(TaskEvent(f"scoring photo {position + 1}/{len(own_views)}", position / len(own_views)))
             comparison = scorer.compare(view)
             if comparison is None:
                 scores.append((number, None, 0.0))
@@ -151,7 +151,7 @@ def evaluate_model(
                     if unwritten is None:
                         raise
                     unwritten.append(str(error))
-        progress(TaskEvent(f"scored {format_count(len(own), 'photo')}", 1.0))
+        progress(TaskEvent(f"scored {format_count(len(own_views), 'photo')}", 1.0))
         return scores
 
     with nullcontext() if pictures is None else exclusive_folder(pictures, ranks=ranks):

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.evaluate.metrics import MAX_PART_PIXELS, counted_pixels, to_8bit
+from hyrfpack.evaluate.metrics import MAX_PART_PIXELS, iterate_counted_pixels, to_8bit
 from hyrfpack.model.exposure import apply_exposure_gains
 
 # Gains are fitted to pixels that have every channel in this range, in the photo and in the render.
@@ -107,8 +107,8 @@ def correct_colors(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> 
 
 
 def _finite_pixels(image: Tensor, photo: Tensor, mask: Tensor | None) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield the parts of `counted_pixels`. Raises ValueError: a picture is not finite."""
-    for rendered, target in counted_pixels(image, photo, mask):
+    """Yield the parts of `iterate_counted_pixels`. Raises ValueError: a picture is not finite."""
+    for rendered, target in iterate_counted_pixels(image, photo, mask):
         if not (rendered.isfinite().all() and target.isfinite().all()):
             raise ValueError("a picture to be compared is not finite")
         yield rendered, target

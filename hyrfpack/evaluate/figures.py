@@ -60,7 +60,7 @@ def draw_comparison(
         error = np.where(counted, error, 0)
     height, width = error.shape
     size = _panel_size(width, height)
-    panels = [_panel(pixels, size) for pixels in (dimmed_photo, render.cpu().numpy(), error_colors(error))]
+    panels = [_panel(pixels, size) for pixels in (dimmed_photo, render.cpu().numpy(), map_error_colors(error))]
 
     text, line = _font(size[0]), _line_height(size[0])
     sheet = Image.new("RGB", (3 * size[0] + 2 * GAP_PIXELS, size[1] + 2 * line + GAP_PIXELS), PAPER_COLOR)
@@ -80,10 +80,10 @@ def split_comparison(sheet: Image.Image) -> list[Image.Image]:
     Raises:
         ValueError: the picture has another layout.
     """
-    width, rest = divmod(sheet.width - 2 * GAP_PIXELS, 3)
+    width, remainder = divmod(sheet.width - 2 * GAP_PIXELS, 3)
     top = _line_height(width) if width > 0 else 0
     height = sheet.height - 2 * top - GAP_PIXELS
-    if rest or width < 1 or height < 1:
+    if remainder or width < 1 or height < 1:
         raise ValueError("it has not the size of photo, render and error map beside each other")
     sheet = sheet.convert("RGB")
     lefts = [column * (width + GAP_PIXELS) for column in range(3)]
@@ -127,7 +127,7 @@ def draw_training_curve(records: Sequence[dict], path: str | os.PathLike[str], *
     Raises:
         HyrfError: the file cannot be written.
     """
-    figure = blank_figure(9, 6, layout=None)  # matplotlib's constrained layout takes longer than drawing
+    figure = make_blank_figure(9, 6, layout=None)  # matplotlib's constrained layout takes longer than drawing
     axes = figure.subplots(3, 1, sharex=True, gridspec_kw=CURVE_MARGINS)
     steps = [record["step"] for record in records]
     for axis, key, label, color in zip(
@@ -140,7 +140,7 @@ def draw_training_curve(records: Sequence[dict], path: str | os.PathLike[str], *
         values = [record[key] for record in records]
         if key != "gaussians":
             axis.plot(steps, values, color=color, linewidth=0.8, alpha=0.35)
-            values = running_mean(values)
+            values = compute_running_mean(values)
         axis.plot(steps, values, color=color, linewidth=1.5)
         axis.set_ylabel(label)
         axis.yaxis.set_label_coords(-0.077, 0.5)  # aligns the labels, left of the widest numbers
@@ -169,7 +169,7 @@ def require_matplotlib() -> None:
         import matplotlib.figure  # noqa: F401
 
 
-def blank_figure(width: float, height: float, layout: Literal["constrained"] | None = "constrained") -> Figure:
+def make_blank_figure(width: float, height: float, layout: Literal["constrained"] | None = "constrained") -> Figure:
     """Return an empty matplotlib figure with the Agg backend, which needs no display.
 
     Args:
@@ -221,7 +221,7 @@ def _panel(pixels: np.ndarray, size: tuple[int, int]) -> Image.Image:
     return image if image.size == size else image.resize(size, Image.Resampling.BOX)
 
 
-def running_mean(values: Sequence[float]) -> list[float]:
+def compute_running_mean(values: Sequence[float]) -> list[float]:
     """Return running means over each value and SMOOTHING_RADIUS_RECORDS values on either side.
 
     The windows shrink towards the ends.
@@ -230,7 +230,7 @@ def running_mean(values: Sequence[float]) -> list[float]:
     return [fmean(values[index - radius : index + radius + 1]) for index, radius in enumerate(reach)]
 
 
-def error_colors(error: np.ndarray) -> np.ndarray:
+def map_error_colors(error: np.ndarray) -> np.ndarray:
     """Map errors (H, W) to colours (H, W, 3), from black at 0 to the brightest colour at ERROR_LIMIT and above."""
     with _quiet_matplotlib():
         from matplotlib import colormaps
@@ -247,7 +247,7 @@ def _color_bar(
     middle = top + height // 2
     start = left + (width - length) // 2
     ramp = np.broadcast_to(np.linspace(0, ERROR_LIMIT, length), (thickness, length))
-    sheet.paste(_panel(error_colors(ramp), (length, thickness)), (start, middle - thickness // 2))
+    sheet.paste(_panel(map_error_colors(ramp), (length, thickness)), (start, middle - thickness // 2))
     draw.text((start - GAP_PIXELS, middle), "error 0", LABEL_COLOR, text, anchor="rm")
     draw.text((start + length + GAP_PIXELS, middle), f"{ERROR_LIMIT:g}+", LABEL_COLOR, text, anchor="lm")
 

@@ -38,13 +38,13 @@ def psnr(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:
         PSNR in dB, at most `IDENTICAL_PSNR`.
     """
     total, count = 0.0, 0
-    for shown, expected in counted_pixels(image, reference, mask):
-        total += float((shown - expected).square().sum())
-        count += shown.numel()
+    for rendered, target in iterate_counted_pixels(image, reference, mask):
+        total += float((rendered - target).square().sum())
+        count += rendered.numel()
     return psnr_from_mse(total / count)
 
 
-def counted_pixels(image: Tensor, reference: Tensor, mask: Tensor | None) -> Iterator[tuple[Tensor, Tensor]]:
+def iterate_counted_pixels(image: Tensor, reference: Tensor, mask: Tensor | None) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield the pixels of two pictures that count, in parts.
 
     Args:
@@ -56,8 +56,8 @@ def counted_pixels(image: Tensor, reference: Tensor, mask: Tensor | None) -> Ite
     flat, counted = [picture.reshape(-1, 3) for picture in (image, reference)], None if mask is None else mask.flatten()
     for start in range(0, len(flat[0]), MAX_PART_PIXELS):
         part = slice(start, start + MAX_PART_PIXELS)
-        shown, expected = (colors[part] if counted is None else colors[part][counted[part]] for colors in flat)
-        yield shown.double(), expected.double()
+        rendered, target = (colors[part] if counted is None else colors[part][counted[part]] for colors in flat)
+        yield rendered.double(), target.double()
 
 
 def provenance_mse(provenance: dict) -> float:
@@ -68,10 +68,10 @@ def provenance_mse(provenance: dict) -> float:
     Args:
         provenance: provenance of the file. Its `psnr` is used, or ASSUMED_PSNR_DB if that is missing or out of range.
     """
-    stated = provenance.get("psnr")
-    if not isinstance(stated, int | float) or not 0 < stated < IDENTICAL_PSNR:
-        stated = ASSUMED_PSNR_DB
-    return math.exp(-stated / 10 * math.log(10))
+    psnr_db = provenance.get("psnr")
+    if not isinstance(psnr_db, int | float) or not 0 < psnr_db < IDENTICAL_PSNR:
+        psnr_db = ASSUMED_PSNR_DB
+    return math.exp(-psnr_db / 10 * math.log(10))
 
 
 def ssim(image: Tensor, reference: Tensor, mask: Tensor | None = None) -> float:

@@ -132,12 +132,12 @@ def _color_renderer(
     if isinstance(model, Drawable):
         return lambda camera: (draw(model, camera, settings).rgb, None)
     if isinstance(model, MergedModel):
-        parts = model.decode()
-        return lambda camera: (render_view(model, camera, settings, decoded=parts).rgb, None)
-    decoded, at_one_exposure = model.decode(), replace(settings, exposure=CONSISTENT_EXPOSURE)
+        decoded_parts = model.decode()
+        return lambda camera: (render_view(model, camera, settings, decoded=decoded_parts).rgb, None)
+    decoded, consistent_settings = model.decode(), replace(settings, exposure=CONSISTENT_EXPOSURE)
 
     def draw_colors(camera: Camera) -> tuple[Tensor, Tensor | None]:
-        rgb = render_view(model, camera, at_one_exposure, decoded=decoded).rgb
+        rgb = render_view(model, camera, consistent_settings, decoded=decoded).rgb
         if model.exposure is None:
             return rgb, None
         return apply_exposure_map(model, camera, rgb) if settings.exposure == AS_PHOTOGRAPHED else rgb, rgb

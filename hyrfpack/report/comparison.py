@@ -13,8 +13,8 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
 from hyrfpack.outputs import Outputs, StrPath
 from hyrfpack.report.comparison_page import encode_comparison
-from hyrfpack.report.differences import check_scores, comparability_warnings
-from hyrfpack.report.run import read_run, short_names
+from hyrfpack.report.differences import check_scores, describe_doubts
+from hyrfpack.report.run import choose_short_names, read_run
 from hyrfpack.report.views import read_views
 
 
@@ -75,11 +75,11 @@ def compare_runs(runs: Sequence[StrPath], out: StrPath, *, overwrite: bool = Fal
         for path in (run.folder / METRICS_FILE, run.folder / MODEL_FILE, *run.pictures.values())
     ]
     Outputs(*source_files, overwrite=overwrite).file(out, ".html", ".htm")
-    names = short_names(folders)
+    names = choose_short_names(folders)
     check_scores(loaded_runs, names)
     views = read_views(loaded_runs)
-    sentences = comparability_warnings(loaded_runs, names, [view.name for view in views if not view.same])
-    views = [view for view in views if view.same]
-    page = encode_comparison(loaded_runs, names, views, sentences)
-    written = write_atomic(out, page, overwrite=overwrite)
-    return ComparisonReport(str(written), len(page), names, [view.name for view in views], sentences)
+    doubts = describe_doubts(loaded_runs, names, [view.name for view in views if not view.shows_same_photo])
+    views = [view for view in views if view.shows_same_photo]
+    page = encode_comparison(loaded_runs, names, views, doubts)
+    written_path = write_atomic(out, page, overwrite=overwrite)
+    return ComparisonReport(str(written_path), len(page), names, [view.name for view in views], doubts)

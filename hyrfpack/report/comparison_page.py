@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from hyrfpack.counts import format_count
-from hyrfpack.evaluate.figures import ERROR_LIMIT, SMOOTHING_RADIUS_RECORDS, error_colors
-from hyrfpack.report.curves import draw_curves, has_times, line_style
-from hyrfpack.report.differences import choices_that_differ, notes_that_differ, settings_that_differ
+from hyrfpack.evaluate.figures import ERROR_LIMIT, SMOOTHING_RADIUS_RECORDS, map_error_colors
+from hyrfpack.report.curves import choose_line_style, draw_curves, has_times
+from hyrfpack.report.differences import find_differing_choices, find_differing_notes, find_differing_settings
 from hyrfpack.report.page import embed_figure, encode_page, escape, paragraph, read_asset, section, table, table_row
 from hyrfpack.report.run import Run
 from hyrfpack.report.views import ComparedView, webp_data_uri
@@ -64,10 +64,10 @@ def _tables(runs: Sequence[Run], names: Sequence[str], ranked: bool) -> list[str
         table_row("steps", [f"{run.settings['steps']:,}" for run in runs]),
         table_row("seed", [str(run.settings["seed"]) for run in runs]),
     ]
-    notes = ["; ".join(notes) or "-" for notes in notes_that_differ(runs)]
+    notes = ["; ".join(notes) or "-" for notes in find_differing_notes(runs)]
     differing = {
-        "Settings": settings_that_differ(runs),
-        "Choices": choices_that_differ(runs),
+        "Settings": find_differing_settings(runs),
+        "Choices": find_differing_choices(runs),
         "Notes": {"from reading the photos": notes} if len(set(notes)) > 1 else {},
     }
     header = ["", *(f"{_swatch(number)}{escape(name)}" for number, name in enumerate(names))]
@@ -97,7 +97,7 @@ def _legend(names: Sequence[str]) -> str:
 
 def _swatch(number: int) -> str:
     """Return a sample of a run's line as SVG."""
-    color, dashes = line_style(number)
+    color, dashes = choose_line_style(number)
     dashed = f' stroke-dasharray="{dashes}"' if dashes else ""
     line = f'<path d="M0 4h26" stroke="{color}" stroke-width="3"{dashed}/>'
     return f'<svg class="swatch" viewBox="0 0 26 8" aria-hidden="true">{line}</svg>'
@@ -117,7 +117,7 @@ def _curves_note(runs: Sequence[Run], names: Sequence[str]) -> str:
 def _view_data(runs: Sequence[Run], names: Sequence[str], views: Sequence[ComparedView]) -> dict:
     """Return the data of the page's script: photo, renders and scores of each view, and the error colours."""
     scores = [{score.name: [score.psnr, score.ssim, score.lpips] for score in run.scores} for run in runs]
-    ramp = (error_colors(np.linspace(0, ERROR_LIMIT, 256)) * 255).round().astype(np.uint8)
+    ramp = (map_error_colors(np.linspace(0, ERROR_LIMIT, 256)) * 255).round().astype(np.uint8)
     return {
         "runs": list(names),
         "views": [

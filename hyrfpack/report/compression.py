@@ -123,9 +123,9 @@ def _write_report(
     scene = place_photos(describe_file(source), scene)
     views, views_in_words = _views_to_score(model, source, scene)
     _LOG.info(f"comparing renders with {views_in_words} for the report")
-    before = evaluate_model(model, views)
+    model_scores = evaluate_model(model, views)
     facts, data = describe_file(packed), _read_bytes(packed)
-    scored = [view for view in views if view.name not in before.skipped]
+    scored = [view for view in views if view.name not in model_scores.skipped]
 
     profiles = _encode_other_profiles(model, provenance, report.profile)
     curve = {}
@@ -139,26 +139,26 @@ def _write_report(
         # The written file is the curve's point at its distortion, unless fine-tuning moved it off the curve.
         written_file = data if report.profile == "compact" and not report.finetuned else None
         curve = _encode_curve(model, provenance, sensitivity, distortion, written_file)
-    at_same_distortion = [name for name, other in curve.items() if other is data]
+    at_same_distortion = [name for name, encoded in curve.items() if encoded is data]
     files = {
         WRITTEN_FILE_LABEL: data,
         **profiles,
-        **{name: other for name, other in curve.items() if name not in at_same_distortion},
+        **{name: encoded for name, encoded in curve.items() if name not in at_same_distortion},
     }
     points, decoded = _measure_files(files, scored)
 
-    shown, amplified = _write_pictures(
-        folder, model, decoded[WRITTEN_FILE_LABEL], scored, before, points[WRITTEN_FILE_LABEL].scores, overwrite
+    shown_views, amplification = _write_pictures(
+        folder, model, decoded[WRITTEN_FILE_LABEL], scored, model_scores, points[WRITTEN_FILE_LABEL].scores, overwrite
     )
     findings = Findings(
         views=views_in_words,
         has_photos=scene is not None,
-        before=before,
+        before=model_scores,
         chosen=points[WRITTEN_FILE_LABEL],
         profiles=[points[name] for name in profiles],
         curve=[points[WRITTEN_FILE_LABEL if name in at_same_distortion else name] for name in curve],
-        shown=shown,
-        amplified=amplified,
+        shown=shown_views,
+        amplification=amplification,
         gaussians=len(model),
         machine=format_machine(describe_machine()),
         writer=facts["writer"],
@@ -197,10 +197,10 @@ def _distortion_of_file(facts: dict, model: HybridModel, provenance: dict) -> fl
 def _encode_other_profiles(model: HybridModel, provenance: dict, written_profile: str) -> dict[str, bytes]:
     """Encode the model in the profiles that have no settings, except the profile that was written already."""
     files = {}
-    for profile, kept in (("raw", provenance), ("paper", packed_provenance(provenance, model))):
+    for profile, kept_provenance in (("raw", provenance), ("paper", packed_provenance(provenance, model))):
         with suppress(HyrfError):  # half precision cannot represent every model
             if profile != written_profile:
-                files[profile] = encode_model(model, profile, kept)
+                files[profile] = encode_model(model, profile, kept_provenance)
     return files
 
 
@@ -244,8 +244,8 @@ def _write_pictures(
     model: HybridModel,
     packed: HybridModel,
     views: Sequence[View],
-    before: Evaluation,
-    after: Evaluation,
+    model_scores: Evaluation,
+    packed_scores: Evaluation,
     overwrite: bool,
 ) -> tuple[list[ShownView], int]:
     """Write renders of both models and their difference, from the view that loses most to the one that loses least.
@@ -253,7 +253,9 @@ def _write_pictures(
     Returns:
         The shown views, and the amplification of the differences.
     """
-    scored = sorted(zip(views, before.views, after.views, strict=True), key=lambda item: item[2].psnr - item[1].psnr)
+    scored = sorted(
+        zip(views, model_scores.views, packed_scores.views, strict=True), key=lambda item: item[2].psnr - item[1].psnr
+    )
     chosen = evenly_spaced(scored, MAX_SHOWN_VIEWS)
     decoded_models = model.decode(), packed.decode()
     pairs = [
@@ -263,19 +265,21 @@ def _write_pictures(
         )
         for view, *_ in chosen
     ]
-    psnr_between = [psnr(new, old) for old, new in pairs]
-    amplified = amplification(min(psnr_between))
-    shown = []
-    for number, ((view, old, new), pair, distance) in enumerate(zip(chosen, pairs, psnr_between, strict=True), 1):
+    psnr_between = [psnr(packed_picture, model_picture) for model_picture, packed_picture in pairs]
+    amplification = choose_amplification(min(psnr_between))
+    shown_views = []
+    for number, ((view, model_score, packed_score), pair, view_psnr) in enumerate(
+        zip(chosen, pairs, psnr_between, strict=True), 1
+    ):
         names = picture_names(number)
-        for name, picture in zip(names, (*pair, amplified * (pair[1] - pair[0]).abs()), strict=True):
+        for name, picture in zip(names, (*pair, amplification * (pair[1] - pair[0]).abs()), strict=True):
             save_picture(folder / name, to_image(picture), overwrite=overwrite, rename=False)
-        shown.append(ShownView(view.name, old.psnr, new.psnr, distance, names))
-    return shown, amplified
+        shown_views.append(ShownView(view.name, model_score.psnr, packed_score.psnr, view_psnr, names))
+    return shown_views, amplification
 
 
-def amplification(psnr_between: float) -> int:
-    """Return the amplification that makes the difference between two renders visible.
+def choose_amplification(psnr_between: float) -> int:
+    """Choose the amplification that makes the difference between two renders visible.
 
     Args:
         psnr_between: PSNR between the renders, dB.

@@ -76,7 +76,7 @@ class Findings:
         profiles: the model in the other profiles, which have no settings.
         curve: the model in profile "compact" at several distortions, smallest distortion first.
         shown: views whose pictures are shown, the one that loses most first.
-        amplified: factor by which the difference pictures are amplified.
+        amplification: factor by which the difference pictures are amplified.
         gaussians: number of Gaussians of the uncompressed model.
         machine: the machine on which times were measured.
         writer: the program that wrote the file, and its version.
@@ -89,7 +89,7 @@ class Findings:
     profiles: list[MeasuredFile]
     curve: list[MeasuredFile]
     shown: list[ShownView]
-    amplified: int
+    amplification: int
     gaussians: int
     machine: str
     writer: str
@@ -122,7 +122,7 @@ def encode_compression_page(
         plot: HTML of the plot of all files.
         command: command line that makes the file again; empty if unknown.
     """
-    heading = headline(report, findings)
+    heading = format_headline(report, findings)
     content = [
         *map(paragraph, _summarize(source, packed, report, findings)),
         section("sizes", "Size of each part", *_section_sizes(report)),
@@ -131,21 +131,21 @@ def encode_compression_page(
     ]
     if command:
         content.append(section("command", "Command that makes this file again", f"<pre>{escape(command)}</pre>"))
-    written = f"Written by {findings.writer}. Times were measured on this machine: {findings.machine}."
-    content.append(paragraph(written, "small"))
+    origin = f"Written by {findings.writer}. Times were measured on this machine: {findings.machine}."
+    content.append(paragraph(origin, "small"))
     return encode_page(heading, content, title=f"{packed.name}: {heading}", pictures="'self'")
 
 
-def headline(report: CompressionReport, findings: Findings) -> str:
+def format_headline(report: CompressionReport, findings: Findings) -> str:
     """Summarise the result in a few words: "183 kB, 5.8 times smaller, 0.04 dB lost"."""
-    size = size_in_words(report.bytes_after)
+    size = format_size(report.bytes_after)
     if report.profile == "raw":
         return f"{size}, every number exact, nothing lost"
     ratio = report.bytes_before / report.bytes_after
     return f"{size}, {ratio:.1f} times smaller, {_loss_in_words(findings)}"
 
 
-def size_in_words(count: float) -> str:
+def format_size(count: float) -> str:
     """Format a number of bytes with three significant digits; k, M and G are powers of 1000."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= 0.9995 * factor:
@@ -247,7 +247,7 @@ def _alternatives(findings: Findings, plot: str) -> list[str]:
 
 
 def _view_pictures(findings: Findings) -> list[str]:
-    labels = ("before", "after", f"difference, amplified {findings.amplified} times")
+    labels = ("before", "after", f"difference, amplified {findings.amplification} times")
     figures = []
     for view in findings.shown:
         caption = f"{view.name}: {view.between:.1f} dB between before and after"
@@ -264,7 +264,7 @@ def _view_pictures(findings: Findings) -> list[str]:
         figures.append(f'<figure><div class="triple">{pictures}</div>{caption}</figure>')
     intro = (
         "Renders of the model before compression and of the compressed file. The third picture is the absolute "
-        f"difference in each colour channel, amplified {findings.amplified} times; black means no difference. The "
+        f"difference in each colour channel, amplified {findings.amplification} times; black means no difference. The "
         "views are sorted from the largest loss to the smallest. Select a picture to see it in full size."
     )
     return [paragraph(intro), *figures]

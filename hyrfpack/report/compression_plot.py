@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from hyrfpack.evaluate.figures import blank_figure
-from hyrfpack.report.compression_page import Findings, MeasuredFile, size_in_words
+from hyrfpack.evaluate.figures import make_blank_figure
+from hyrfpack.report.compression_page import Findings, MeasuredFile, format_size
 from hyrfpack.report.page import LIGHT_TEXT_COLOR, style_axes
 
 if TYPE_CHECKING:
@@ -21,23 +21,23 @@ RAW_COLOR = LIGHT_TEXT_COLOR  # becomes DARK_TEXT_COLOR on dark backgrounds, as 
 
 def draw_plot(findings: Findings) -> Figure:
     """Plot loss and decoding time over bytes. A line joins the "compact" files, and a ring marks the written file."""
-    figure = blank_figure(9, 6.5)
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    figure = make_blank_figure(9, 6.5)
+    loss_axes, time_axes = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     exact = [point for point in findings.points if findings.is_exact(point.scores)]
     finite = [point for point in findings.points if point not in exact]
-    _scatter(above, findings, finite, lambda point: findings.fidelity(point.scores))
-    _scatter(below, findings, findings.points, lambda point: point.decode_ms)
+    _scatter(loss_axes, findings, finite, lambda point: findings.fidelity(point.scores))
+    _scatter(time_axes, findings, findings.points, lambda point: point.decode_ms)
     for point in finite:
-        _label_point(above, findings, point, (point.bytes, findings.fidelity(point.scores)), "data")
+        _label_point(loss_axes, findings, point, (point.bytes, findings.fidelity(point.scores)), "data")
     for point in exact:  # an exact file has infinite PSNR, so it is a vertical line
-        above.axvline(point.bytes, color=_point_color(findings, point), linestyle=":")
-        _label_point(above, findings, point, (point.bytes, 0.5), ("data", "axes fraction"))
-    above.set_ylabel("PSNR lost (dB): less is better" if findings.has_photos else "PSNR (dB): more is better")
-    below.set(xscale="log", xlabel="size of the file", ylabel="decoding (ms)")
-    below.set_ylim(bottom=0)
-    ticks = _round_sizes(*below.get_xlim())
-    below.set_xticks(ticks, [size_in_words(tick) for tick in ticks])
-    below.set_xticks([], minor=True)
+        loss_axes.axvline(point.bytes, color=_point_color(findings, point), linestyle=":")
+        _label_point(loss_axes, findings, point, (point.bytes, 0.5), ("data", "axes fraction"))
+    loss_axes.set_ylabel("PSNR lost (dB): less is better" if findings.has_photos else "PSNR (dB): more is better")
+    time_axes.set(xscale="log", xlabel="size of the file", ylabel="decoding (ms)")
+    time_axes.set_ylim(bottom=0)
+    ticks = _round_sizes(*time_axes.get_xlim())
+    time_axes.set_xticks(ticks, [format_size(tick) for tick in ticks])
+    time_axes.set_xticks([], minor=True)
     return figure
 
 
@@ -55,13 +55,17 @@ def _scatter(
     axes.margins(x=0.12, y=0.15)
 
 
-def _label_point(axes: Axes, findings: Findings, point: MeasuredFile, place: tuple[float, float], system: Any) -> None:
+def _label_point(
+    axes: Axes, findings: Findings, point: MeasuredFile, position: tuple[float, float], coordinates: Any
+) -> None:
     """Label a point, unless it lies on the line; the label is on the side away from the line."""
     if point is findings.chosen or point in findings.profiles:
-        words = f"{point.name}: exact" if findings.is_exact(point.scores) else point.name
+        label = f"{point.name}: exact" if findings.is_exact(point.scores) else point.name
         offset = (8, 8) if findings.has_photos else (8, -16)
         color = _point_color(findings, point)
-        axes.annotate(words, place, offset, system, "offset points", color=color, weight="bold", annotation_clip=False)
+        axes.annotate(
+            label, position, offset, coordinates, "offset points", color=color, weight="bold", annotation_clip=False
+        )
 
 
 def _point_color(findings: Findings, point: MeasuredFile) -> str:

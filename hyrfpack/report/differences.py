@@ -11,7 +11,7 @@ from hyrfpack.report.run import Run
 ALWAYS_SHOWN_SETTINGS = ("steps", "seed")
 
 
-def settings_that_differ(runs: Sequence[Run]) -> dict[str, list[str]]:
+def find_differing_settings(runs: Sequence[Run]) -> dict[str, list[str]]:
     """Return, by name, the values of all runs for settings, scene facts and device that differ between runs."""
     values_of_runs = []
     for run in runs:
@@ -21,12 +21,12 @@ def settings_that_differ(runs: Sequence[Run]) -> dict[str, list[str]]:
     return _differing_rows(values_of_runs)
 
 
-def choices_that_differ(runs: Sequence[Run]) -> dict[str, list[str]]:
+def find_differing_choices(runs: Sequence[Run]) -> dict[str, list[str]]:
     """Return, by name, the automatic choices of all runs, with reasons, where they differ between runs."""
     return _differing_rows([run.choices for run in runs])
 
 
-def notes_that_differ(runs: Sequence[Run]) -> list[list[str]]:
+def find_differing_notes(runs: Sequence[Run]) -> list[list[str]]:
     """Return for each run its notes that are not common to all runs."""
     common = set.intersection(*(set(run.notes) for run in runs))
     return [[note for note in run.notes if note not in common] for run in runs]
@@ -39,18 +39,18 @@ def check_scores(runs: Sequence[Run], names: Sequence[str]) -> None:
         HyrfDataError: two runs have held-out photos of different names.
     """
     scored = [(run, name) for run, name in zip(runs, names, strict=True) if run.held_out]
-    for (first, first_name), (other, name) in zip(scored[:1] * len(scored), scored, strict=True):
-        if other.held_out != first.held_out:
-            odd = min(other.held_out ^ first.held_out)
+    for (first, first_name), (run, name) in zip(scored[:1] * len(scored), scored, strict=True):
+        if run.held_out != first.held_out:
+            example = min(run.held_out ^ first.held_out)
             raise HyrfDataError(
-                f"{other.folder}: the runs '{first_name}' and '{name}' hold out different photos "
-                f"({len(first.held_out)} and {len(other.held_out)}; '{odd}' is in only one of them), so that their "
+                f"{run.folder}: the runs '{first_name}' and '{name}' hold out different photos "
+                f"({len(first.held_out)} and {len(run.held_out)}; '{example}' is in only one of them), so that their "
                 "scores cannot be compared",
                 fix="train both on the same photos with the same `test_every`",
             )
 
 
-def comparability_warnings(runs: Sequence[Run], names: Sequence[str], changed: Sequence[str]) -> list[str]:
+def describe_doubts(runs: Sequence[Run], names: Sequence[str], changed: Sequence[str]) -> list[str]:
     """Return a sentence for each reason why some numbers of the runs cannot be compared.
 
     Args:
@@ -58,25 +58,25 @@ def comparability_warnings(runs: Sequence[Run], names: Sequence[str], changed: S
         names: their names on the page.
         changed: names of held-out photos that differ between the pictures of the runs.
     """
-    found = []
+    doubts = []
     without_scores = [name for run, name in zip(runs, names, strict=True) if not run.scores]
     if without_scores and len(without_scores) < len(runs):
-        found.append(
+        doubts.append(
             f"No photos were held out in {_quoted(without_scores)}, so only the curves and the sizes can be compared."
         )
     elif without_scores:
-        found.append("No photos were held out in these runs, so only their curves and sizes are compared.")
+        doubts.append("No photos were held out in these runs, so only their curves and sizes are compared.")
     if changed:
-        found.append(
+        doubts.append(
             f"The held-out photos differ between the runs (such as {_quoted(changed[:1])}), so their scores cannot be "
             "compared. The scene, the size, the undistortion or the colour behind transparent photos is different."
         )
     elif any(run.cameras != runs[0].cameras for run in runs):
-        found.append(
+        doubts.append(
             "The runs were trained from different cameras, so their curves cannot be compared. The photos, the poses, "
             "the sizes or the scene are different."
         )
-    return found
+    return doubts
 
 
 def _quoted(names: Sequence[str]) -> str:

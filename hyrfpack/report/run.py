@@ -124,7 +124,7 @@ def read_run(folder: StrPath) -> Run:
     except _DamagedMetrics as error:
         reason = str(error)
     except (ValueError, RecursionError):
-        reason = "it is no JSON"
+        reason = "it is not JSON"
     raise HyrfDataError(f"{path}: the metrics are damaged ({reason})", fix="train the run anew with `overwrite=True`")
 
 
@@ -135,7 +135,7 @@ def _refuse_constant(name: str) -> None:
 def _parse_run(folder: Path, metrics: Any) -> Run:
     """Return the run that the metrics describe; raise _DamagedMetrics if they are damaged."""
     if not isinstance(metrics, dict):
-        raise _DamagedMetrics("it is no object")
+        raise _DamagedMetrics("it is not an object")
     evaluation = _read_field(metrics, "evaluation", dict) if "evaluation" in metrics else {}
     scores = [_parse_score(values) for values in _read_field(evaluation, "views", list)] if evaluation else []
     skipped = list(map(str, _read_field(evaluation, "skipped", list))) if evaluation else []
@@ -144,9 +144,9 @@ def _parse_run(folder: Path, metrics: Any) -> Run:
         raise _DamagedMetrics("'curve' is empty")
     settings = _read_field(metrics, "settings", dict)
     for name in ("steps", "seed"):
-        _read_number(settings, name, int, most=2**64)
+        _read_number(settings, name, int, maximum=2**64)
     if settings["steps"] < 1:
-        raise _DamagedMetrics("'steps' is not a number that can be")
+        raise _DamagedMetrics("'steps' is less than 1")
     return Run(
         folder=folder,
         files=_file_sizes(folder),
@@ -192,11 +192,11 @@ def _read_field(values: Any, name: str, kind: type) -> Any:
     return values[name]
 
 
-def _read_number(values: Any, name: str, kind: type = float, most: float = MAX_NUMBER) -> Any:
+def _read_number(values: Any, name: str, kind: type = float, maximum: float = MAX_NUMBER) -> Any:
     value: Any = values.get(name) if isinstance(values, dict) else None
     has_right_type = isinstance(value, int | float if kind is float else int) and not isinstance(value, bool)
-    if not has_right_type or not abs(value) <= most:  # also rejects NaN
-        raise _DamagedMetrics(f"'{name}' is missing or not a number that can be")
+    if not has_right_type or not abs(value) <= maximum:  # also rejects NaN
+        raise _DamagedMetrics(f"'{name}' is missing or not a number in its range")
     return value
 
 
@@ -216,7 +216,7 @@ def _existing_pictures(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     return {name: path for name, path in files.items() if path.is_file()}
 
 
-def short_names(folders: Sequence[Path]) -> list[str]:
+def choose_short_names(folders: Sequence[Path]) -> list[str]:
     """Return a short name for each run: the last parts of its path that distinguish it from the other runs."""
     parts = [Path(os.path.abspath(folder)).parts for folder in folders]
     for count in range(1, max(map(len, parts)) + 1):

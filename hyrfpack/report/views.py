@@ -28,13 +28,13 @@ class ComparedView:
         name: name of the photo.
         photo: the photo as the runs were scored on it.
         renders: the render of each run.
-        same: whether the photo looks the same in all runs.
+        shows_same_photo: whether the photo looks the same in all runs.
     """
 
     name: str
     photo: Image.Image
     renders: list[Image.Image]
-    same: bool
+    shows_same_photo: bool
 
 
 def read_views(runs: Sequence[Run]) -> list[ComparedView]:
@@ -47,8 +47,8 @@ def read_views(runs: Sequence[Run]) -> list[ComparedView]:
     views = []
     for name in names:
         photos, renders = zip(*(_read_photo_and_render(run.pictures[name]) for run in runs), strict=True)
-        same = all(_look_same(photos[0], photo) for photo in photos[1:])
-        views.append(ComparedView(name, photos[0], list(renders), same))
+        shows_same_photo = all(_look_same(photos[0], photo) for photo in photos[1:])
+        views.append(ComparedView(name, photos[0], list(renders), shows_same_photo))
     return views
 
 
@@ -64,11 +64,11 @@ def _read_photo_and_render(path: Path) -> tuple[Image.Image, Image.Image]:
     return photo, render
 
 
-def _look_same(first: Image.Image, other: Image.Image) -> bool:
-    if first.size != other.size:
+def _look_same(first: Image.Image, second: Image.Image) -> bool:
+    if first.size != second.size:
         return False
     return (
-        float(np.abs(np.asarray(first, np.float32) - np.asarray(other, np.float32)).mean())
+        float(np.abs(np.asarray(first, np.float32) - np.asarray(second, np.float32)).mean())
         <= MAX_MEAN_DIFFERENCE_LEVELS
     )
 

@@ -12,9 +12,9 @@ from scenes import ball_points, ball_scene, ring, small_model
 
 import hyrfpack
 from hyrfpack.bench import operation_calls, rendering, subject
-from hyrfpack.bench.codec import PROFILE_SETTING_VALUES, codec_rows, parameter_errors
-from hyrfpack.bench.operations import hash_encode_rows, mlp_rows, rasterize_rows
-from hyrfpack.bench.rendering import EXACT_SETTINGS, RENDER_SETTING_VALUES, render_rows
+from hyrfpack.bench.codec import PROFILE_SETTING_VALUES, measure_codec, measure_parameter_errors
+from hyrfpack.bench.operations import measure_hash_encode, measure_mlp, measure_rasterize
+from hyrfpack.bench.rendering import EXACT_SETTINGS, RENDER_SETTING_VALUES, measure_renderer
 from hyrfpack.bench.subject import Subject
 from hyrfpack.bench.suite import ROW_FUNCTIONS_BY_GROUP, benchmark_model
 from hyrfpack.config.compress import PaperSettings
@@ -61,7 +61,7 @@ def rms(values) -> float:
 
 
 @pytest.mark.acceptance
-@pytest.mark.parametrize("measure", [rasterize_rows, hash_encode_rows, mlp_rows, render_rows])
+@pytest.mark.parametrize("measure", [measure_rasterize, measure_hash_encode, measure_mlp, measure_renderer])
 def test_every_setting_has_one_reference_without_error_and_one_default(measure):
     for values in rows_by_setting(measure(make_subject(make_model()), 1, [])).values():
         (reference,) = [row for row in values.values() if row.is_reference]
@@ -87,14 +87,14 @@ def test_rasterize_errors_are_against_float64_with_the_same_antialiasing(antiali
         picture = rasterize(Gaussians3D(*gaussians), colors, viewport, settings, implementation=implementation)
         found.append(np.concatenate([picture.rgb.flatten(), picture.transmittance.flatten()]).astype(np.float64))
 
-    rows = rows_by_setting(rasterize_rows(make_subject(model), 1, []))
+    rows = rows_by_setting(measure_rasterize(make_subject(model), 1, []))
     row = rows["antialiased, forward" if antialiased else "forward"]["cpu"]
     assert row.error.max == pytest.approx(np.abs(found[0] - found[1]).max()) and row.error.max > 0
     assert row.error.rms == pytest.approx(rms(found[0] - found[1]))
 
 
 def test_gradient_errors_are_given_for_each_input_and_as_their_maximum():
-    rows = rows_by_setting(rasterize_rows(make_subject(make_model()), 1, []))
+    rows = rows_by_setting(measure_rasterize(make_subject(make_model()), 1, []))
     row = rows["forward + backward"]["cpu"]
     assert set(row.parts) == {"means", "quats", "scales", "opacities", "colors"}
     assert row.error.max == max(part.max for part in row.parts.values())
@@ -109,7 +109,7 @@ def test_half_precision_errors_of_the_fields_are_relative_to_float64():
     table = grid.table.detach()
     exact = hash_encode(coords.double(), table.double(), *settings)
     rounded = hash_encode(coords, table.bfloat16().float(), *settings)
-    row = rows_by_setting(hash_encode_rows(make_subject(model), 1, []))["geometry, forward"]["cpu, bfloat16 table"]
+    row = rows_by_setting(measure_hash_encode(make_subject(model), 1, []))["geometry, forward"]["cpu, bfloat16 table"]
     assert row.error.rms == pytest.approx(rms(rounded - exact) / rms(exact), rel=1e-4)
     assert 1e-4 < row.error.max == pytest.approx(float((rounded - exact).abs().max() / exact.abs().max()), rel=1e-4)
 
@@ -118,7 +118,7 @@ def test_half_precision_errors_of_the_fields_are_relative_to_float64():
         mlp(features.to(dtype), [w.to(dtype) for w in part.weights], [b.to(dtype) for b in part.biases]).detach()
         for dtype in (torch.bfloat16, torch.float64)
     ]
-    row = rows_by_setting(mlp_rows(make_subject(model), 1, []))["geometry, forward"]["bfloat16 reference"]
+    row = rows_by_setting(measure_mlp(make_subject(model), 1, []))["geometry, forward"]["bfloat16 reference"]
     assert row.error.rms == pytest.approx(rms(outputs[0].double() - outputs[1]) / rms(outputs[1]), rel=0.05)
 
 
@@ -135,14 +135,14 @@ def test_every_setting_that_trades_accuracy_for_speed_is_swept_but_near():
 
 
 def test_the_default_is_among_the_measured_values_of_each_setting():
-    rows = rows_by_setting(render_rows(make_subject(make_model()), 1, []))
+    rows = rows_by_setting(measure_renderer(make_subject(make_model()), 1, []))
     for name, values in RENDER_SETTING_VALUES.items():
         assert len(rows[name]) == len({*values, getattr(RenderSettings(), name)})
 
 
 def test_the_error_of_a_render_setting_isolates_that_setting():
     model = make_model()
-    row = rows_by_setting(render_rows(make_subject(model), 1, []))["background_threshold"]["0.3"]
+    row = rows_by_setting(measure_renderer(make_subject(model), 1, []))["background_threshold"]["0.3"]
     exact, cut = (render_all(model, RenderSettings(background_threshold=tau)).double() for tau in (0, 0.3))
     assert row.error.max == pytest.approx(float((cut - exact).abs().max()), rel=1e-5) and row.error.max > 0.01
     assert row.error.rms == pytest.approx(rms(cut - exact), rel=1e-5)
@@ -151,7 +151,7 @@ def test_the_error_of_a_render_setting_isolates_that_setting():
 
 def test_all_defaults_together_are_compared_with_exact_settings():
     model = make_model()
-    row = rows_by_setting(render_rows(make_subject(model), 1, []))["all"]["defaults"]
+    row = rows_by_setting(measure_renderer(make_subject(model), 1, []))["all"]["defaults"]
     assert row.error.rms == pytest.approx(
         rms(render_all(model).double() - render_all(model, EXACT_SETTINGS).double()), rel=1e-4
     )
@@ -159,7 +159,7 @@ def test_all_defaults_together_are_compared_with_exact_settings():
 
 def test_without_a_background_sphere_its_settings_are_left_out_and_named():
     notes = []
-    rows = rows_by_setting(render_rows(make_subject(make_model(background=False)), 1, notes))
+    rows = rows_by_setting(measure_renderer(make_subject(make_model(background=False)), 1, notes))
     assert "background_stride" not in rows and "cull_tolerance" in rows
     assert len(notes) == 2 and all("no background sphere" in sentence for sentence in notes)
 
@@ -169,7 +169,7 @@ def test_quality_drops_are_differences_of_scores_by_evaluate():
     views = scene.train
     photos = [(torch.from_numpy(view.load().composite()), None) for view in views]
     tested = dataclasses.replace(make_subject(model, photos), cameras=[view.camera for view in views])
-    row = rows_by_setting(render_rows(tested, 1, []))["background_threshold"]["0.3"]
+    row = rows_by_setting(measure_renderer(tested, 1, []))["background_threshold"]["0.3"]
     exact, cut = (
         hyrfpack.evaluate_model(model, views, settings=RenderSettings(background_threshold=tau)) for tau in (0, 0.3)
     )
@@ -182,7 +182,7 @@ def test_quality_drops_are_differences_of_scores_by_evaluate():
 def coded_model(quick_calibration: None) -> tuple[HybridModel, dict[str, dict]]:
     """A model and the measurements of its coding. Tests must not change them."""
     model = make_model()
-    return model, rows_by_setting(codec_rows(make_subject(model), 1, []))
+    return model, rows_by_setting(measure_codec(make_subject(model), 1, []))
 
 
 @pytest.mark.acceptance
@@ -222,7 +222,7 @@ def test_every_setting_of_the_paper_profile_is_measured_with_its_default_marked(
 
 @pytest.mark.acceptance
 def test_every_setting_of_the_compact_profile_is_measured_with_its_default_marked():
-    rows = rows_by_setting(codec_rows(make_subject(make_model(300, scale_logits=-4.0)), 1, []))
+    rows = rows_by_setting(measure_codec(make_subject(make_model(300, scale_logits=-4.0)), 1, []))
     itself = rows["profile"]["compact"]
     for knob, count in (("distortion", 5), ("prune", 2)):
         values = rows[f"compact, {knob}"]
@@ -243,7 +243,7 @@ def test_the_default_file_has_the_bytes_of_the_command(with_photos, data, tmp_pa
     monkeypatch.setattr("hyrfpack.bench.codec.PROFILES", dict.fromkeys(("raw", "compact")))
     monkeypatch.setattr("hyrfpack.bench.codec.PROFILE_SETTING_VALUES", {})
     scene = hyrfpack.load_scene(data) if with_photos else None
-    rows = rows_by_setting(codec_rows(subject.read_subject(DEMO_MODEL_FILE, scene), 1, []))
+    rows = rows_by_setting(measure_codec(subject.read_subject(DEMO_MODEL_FILE, scene), 1, []))
     quiet = hyrfpack.RunContext("cpu", progress=None)
     report = hyrfpack.compress_model(DEMO_MODEL_FILE, tmp_path / "compact.hyrf", data=scene, context=quiet)
     assert rows["profile"]["compact"].is_default and rows["profile"]["compact"].bytes == report.bytes_after
@@ -262,13 +262,13 @@ def test_a_new_profile_is_measured_automatically_and_may_reorder_gaussians(monke
     monkeypatch.setitem(PROFILES, "shuffled", shuffled)
     generator = torch.Generator().manual_seed(5)
     model = make_model(color_logits=torch.randn(60, 3, generator=generator))
-    row = rows_by_setting(codec_rows(make_subject(model), 1, []))["profile"]["shuffled"]
+    row = rows_by_setting(measure_codec(make_subject(model), 1, []))["profile"]["shuffled"]
     assert all(part.max == 0 for part in row.parts.values())
     assert row.error.max < 1e-5
 
 
 def test_parameters_of_another_number_of_gaussians_are_not_compared():
-    errors = parameter_errors(make_model(60), make_model(50))
+    errors = measure_parameter_errors(make_model(60), make_model(50))
     assert set(errors) == {
         "geometry hash table",
         "geometry decoder",
@@ -283,7 +283,7 @@ def test_a_profile_that_cannot_write_the_model_is_omitted_with_the_reason():
     with torch.no_grad():
         model.gaussians.positions[0, 0] = 1e6  # beyond the range of half precision
     notes = []
-    rows = rows_by_setting(codec_rows(make_subject(model), 1, notes))
+    rows = rows_by_setting(measure_codec(make_subject(model), 1, notes))
     assert set(rows["profile"]) == set(PROFILES) - {"paper"} and "paper, color" not in rows
     assert any("'paper' is left out" in sentence and "half precision" in sentence for sentence in notes)
 
@@ -293,14 +293,14 @@ def test_a_result_that_is_not_finite_stops_the_measurement():
     with torch.no_grad():
         model.geometry.biases[-1][0] = torch.nan
     with pytest.raises(HyrfError, match="mlp, geometry, forward"):
-        list(mlp_rows(make_subject(model), 1, []))
+        list(measure_mlp(make_subject(model), 1, []))
 
 
 @pytest.mark.parametrize(
     ("measure", "module", "operation"),
     [
-        (hash_encode_rows, operation_calls, "hash_encode"),
-        pytest.param(render_rows, rendering, "render_view", marks=pytest.mark.acceptance),
+        (measure_hash_encode, operation_calls, "hash_encode"),
+        pytest.param(measure_renderer, rendering, "render_view", marks=pytest.mark.acceptance),
     ],
 )
 def test_the_time_to_compile_kernels_is_not_measured(monkeypatch, measure, module, operation):
@@ -358,7 +358,7 @@ def test_coding_a_quantised_model_again_gives_a_note(tmp_path):
     save_model(make_model(), tmp_path / "tiny.hyrf", "paper")
     read = subject.read_subject(tmp_path / "tiny.hyrf", None)
     notes = []
-    next(iter(codec_rows(dataclasses.replace(read, cameras=RING_CAMERAS, capture=RING_CAMERAS), 1, notes)))
+    next(iter(measure_codec(dataclasses.replace(read, cameras=RING_CAMERAS, capture=RING_CAMERAS), 1, notes)))
     assert any("quantised already" in sentence for sentence in notes)
 
 

@@ -12,7 +12,7 @@ from scenes import ball_points, ball_scene, small_model
 
 from hyrfpack.evaluate import evaluate_model, metrics
 from hyrfpack.evaluate.exposure import correct_colors, fit_gains
-from hyrfpack.evaluate.metrics import counted_pixels, psnr, ssim, to_8bit
+from hyrfpack.evaluate.metrics import iterate_counted_pixels, psnr, ssim, to_8bit
 from hyrfpack.measure.psnr import IDENTICAL_PSNR
 from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
@@ -50,7 +50,7 @@ def test_large_pictures_are_compared_in_parts(masked, monkeypatch):
     mask = random_picture(seed=2)[..., 0] > 0.3 if masked else None
     whole = psnr(image, photo, mask), fit_gains(image, photo, mask), correct_colors(image, photo, mask)
     monkeypatch.setattr(metrics, "MAX_PART_PIXELS", 70)
-    assert {len(part) for part, _ in counted_pixels(image, photo, None)} == {70, 1200 % 70}
+    assert {len(part) for part, _ in iterate_counted_pixels(image, photo, None)} == {70, 1200 % 70}
     parts = psnr(image, photo, mask), fit_gains(image, photo, mask), correct_colors(image, photo, mask)
     for found, expected in zip(parts, whole, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-12)

@@ -21,7 +21,7 @@ from scenes import QUIET_CONTEXT, ball_scene
 import hyrfpack
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.figures import PAPER_COLOR
-from hyrfpack.report.run import read_run, short_names
+from hyrfpack.report.run import choose_short_names, read_run
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig
 
@@ -259,11 +259,11 @@ def test_other_held_out_photos_are_rejected(runs, tmp_path):
 
 
 BROKEN_METRICS = {
-    "text": ("nothing", "it is no JSON"),
-    "cut": ('{"settings": {"steps": 1', "it is no JSON"),
-    "nested": ("[" * 100_000, "it is no JSON"),
-    "bytes": (b"\xff\xfe", "it is no JSON"),
-    "list": ("[1]", "it is no object"),
+    "text": ("nothing", "it is not JSON"),
+    "cut": ('{"settings": {"steps": 1', "it is not JSON"),
+    "nested": ("[" * 100_000, "it is not JSON"),
+    "bytes": (b"\xff\xfe", "it is not JSON"),
+    "list": ("[1]", "it is not an object"),
     "nan": ('{"seconds": NaN}', "a number in it is NaN"),
 }
 
@@ -328,6 +328,6 @@ def test_the_command_reports_its_output_and_doubts(runs, tmp_path):
 
 
 def test_runs_are_named_by_the_shortest_distinct_part_of_their_paths():
-    assert short_names([Path("/x/runs/a"), Path("/x/runs/b")]) == ["a", "b"]
-    assert short_names([Path("/x/a.work/run"), Path("/x/b.work/run")]) == ["a.work/run", "b.work/run"]
-    assert short_names([Path("/run"), Path("/x/run")]) == ["//run", "x/run"]
+    assert choose_short_names([Path("/x/runs/a"), Path("/x/runs/b")]) == ["a", "b"]
+    assert choose_short_names([Path("/x/a.work/run"), Path("/x/b.work/run")]) == ["a.work/run", "b.work/run"]
+    assert choose_short_names([Path("/run"), Path("/x/run")]) == ["//run", "x/run"]

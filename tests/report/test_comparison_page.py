@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from hyrfpack.report.comparison_page import encode_comparison
-from hyrfpack.report.curves import LINE_COLORS, LINE_DASHES, line_style
+from hyrfpack.report.curves import LINE_COLORS, LINE_DASHES, choose_line_style
 from hyrfpack.report.run import Record, Run, Score
 from hyrfpack.report.views import ComparedView
 from tools.browser import chromium
@@ -92,5 +92,5 @@ def test_node_can_parse_the_script_and_a_page_can_embed_it(tmp_path: Path):
 
 
 def test_lines_of_many_runs_can_be_distinguished():
-    styles = [line_style(number) for number in range(len(LINE_COLORS) * len(LINE_DASHES))]
+    styles = [choose_line_style(number) for number in range(len(LINE_COLORS) * len(LINE_DASHES))]
     assert len(set(styles)) == len(styles) == 18

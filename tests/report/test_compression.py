@@ -21,8 +21,8 @@ from hyrfpack.config.compress import CompressConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format import load_model, save_model
-from hyrfpack.report.compression import amplification, write_compression_report
-from hyrfpack.report.compression_page import size_in_words
+from hyrfpack.report.compression import choose_amplification, write_compression_report
+from hyrfpack.report.compression_page import format_size
 from hyrfpack.scene import Scene
 from tools.browser import chromium, firefox
 
@@ -345,9 +345,9 @@ def test_the_json_report_of_a_command_names_the_page(model_file, tmp_path):
     ],
 )
 def test_formatted_sizes_have_three_digits(count, words):
-    assert size_in_words(count) == words
+    assert format_size(count) == words
 
 
 @pytest.mark.parametrize(("between", "times"), [(100.0, 64), (40.0, 32), (30.0, 8), (6.0, 1), (0.0, 1)])
 def test_amplification_makes_the_worst_difference_visible(between, times):
-    assert amplification(between) == times
+    assert choose_amplification(between) == times

@@ -228,7 +228,7 @@ def test_wrong_gradients_fail_the_backward_row_alone(monkeypatch: pytest.MonkeyP
     call = OperationCall(scale, {"x": torch.linspace(1, 2, 5)}, ("x",), (1e-2, 1e-2))
     monkeypatch.setattr(gpu_kernels, "median_ms", lambda *_: {"forward": 1.0, "backward": 1.0})
     works = (gpu_roofline.Work(1.0, 1.0),) * 2
-    forward, backward = gpu_kernels._timed_rows("scale", "5 numbers", call, works, TINY_SETUP, call)
+    forward, backward = gpu_kernels._measure_passes("scale", "5 numbers", call, works, TINY_SETUP, call)
     assert "status" not in forward and forward["value error"] == 0.0
     assert backward["status"] == "failed" and backward["gradient error"] == 1.0
 
@@ -243,7 +243,7 @@ def test_wrong_geometry_of_any_kind_fails_the_row_of_decoding(quantity: str, mon
         return replace(geometry, **{quantity: 2 * getattr(geometry, quantity)}) if self is model else geometry
 
     monkeypatch.setattr(type(model), "decode_geometry", decode_wrongly)
-    geometry, radiance = gpu_kernels.decode_rows(TINY_SETUP)
+    geometry, radiance = gpu_kernels.measure_decode(TINY_SETUP)
     assert geometry["status"] == "failed" and geometry["value error"] == pytest.approx(1.0, abs=0.01)
     assert "status" not in radiance
 

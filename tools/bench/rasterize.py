@@ -15,7 +15,7 @@ from time import perf_counter, process_time
 import torch
 from torch import Tensor
 
-from hyrfpack.bench.operation_calls import random_cotangent, rasterize_call
+from hyrfpack.bench.operation_calls import make_random_cotangent, make_rasterize_call
 from hyrfpack.measure.error import largest_error, measure_error, measure_relative_error
 from hyrfpack.ops.rasterize import INPUT_SHAPES, Gaussians3D, rasterize
 from hyrfpack.ops.viewport import Viewport
@@ -49,7 +49,7 @@ def time_stages(inputs: dict[str, Tensor], viewport: Viewport, implementation: s
     """Run one forward and one backward pass; return the pairs, and the ms of each stage and of CPU time ("_work")."""
     *gaussians, colors = (tensor.detach().clone().requires_grad_() for tensor in inputs.values())
     absgrad, size = torch.zeros(len(colors), 2), (viewport.height, viewport.width)
-    upstream = random_cotangent(torch.empty(*size, 3)), random_cotangent(torch.empty(size))
+    upstream = make_random_cotangent(torch.empty(*size, 3)), make_random_cotangent(torch.empty(size))
     started, work = perf_counter(), process_time()
     picture = rasterize(Gaussians3D(*gaussians), colors, viewport, absgrad=absgrad, implementation=implementation)
     between, work_between = perf_counter(), process_time()
@@ -101,7 +101,7 @@ def measure_errors(inputs: dict[str, Tensor], viewport: Viewport) -> dict[str, f
     five gradients, relative to each gradient's rms. Where alpha or T falls on the other side of its threshold, a few
     pixels differ by more than rounding; `share_beyond_1e-5` is the share of values that differ by more than 1e-5.
     """
-    call = rasterize_call(inputs, viewport)
+    call = make_rasterize_call(inputs, viewport)
     (values, gradients), (exact, slopes) = (
         call.forward_backward_task("cpu")(),
         call.forward_backward_task("reference", torch.float64)(),

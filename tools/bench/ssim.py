@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hyrfpack.bench.operation_calls import loss_call
+from hyrfpack.bench.operation_calls import make_loss_call
 from hyrfpack.measure.error import measure_error, measure_relative_error
 from hyrfpack.measure.timing import time_alternately
 
@@ -27,7 +27,7 @@ def compare(image: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, flo
 
     The gradient's error is relative to its largest value.
     """
-    call = loss_call(image, target, mask)
+    call = make_loss_call(image, target, mask)
     times, results = time_alternately(
         {way: call.forward_backward_task(way) for way in ("cpu", "reference")}, TIMING_REPEATS
     )

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from hyrfpack.bench.operation_calls import (
     OperationCall,
-    decoder_inputs,
-    hash_encode_call,
+    iterate_decoder_inputs,
     join_color_and_transmittance,
-    loss_call,
-    mlp_call,
-    named_fields,
-    rasterize_call,
+    list_named_fields,
+    make_hash_encode_call,
+    make_loss_call,
+    make_mlp_call,
+    make_rasterize_call,
 )
 from hyrfpack.model import HybridModel
 from hyrfpack.ops.adam import adam_step
@@ -61,7 +61,7 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
     yield from ITEM_ROW_GENERATORS[item](setup)
 
 
-def rates_rows(setup: Setup) -> Iterator[Row]:
+def measure_peak_rates(setup: Setup) -> Iterator[Row]:
     """Yield the device's measured peak rates, to which the shares in the other rows refer."""
     rates = measure_rates(setup.torch_device)
     yield {"table": "Measured rates", "rate": "copy, bytes read and written", "value": f"{rates.copy / 1e12:.3f} TB/s"}
@@ -69,11 +69,11 @@ def rates_rows(setup: Setup) -> Iterator[Row]:
     yield {"table": "Measured rates", "rate": "fp32 matrix product", "value": f"{rates.fp32 / 1e12:.1f} TFLOP/s"}
 
 
-def rasterize_rows(name: str, look: Look, setup: Setup) -> Iterator[Row]:
+def measure_rasterize(name: str, look: Look, setup: Setup) -> Iterator[Row]:
     """Measure the whole rasteriser and its stages, forward and backward; the error is that of a crop of the picture."""
     splats = _splats(setup, look)
     call, crop = (
-        rasterize_call(view_splats.inputs, view_splats.viewport)
+        make_rasterize_call(view_splats.inputs, view_splats.viewport)
         for view_splats in (splats, crop_splats(splats, setup.crop))
     )
     raster = rasterize(splats.gaussians, splats.colors, splats.viewport, implementation=setup.implementation)
@@ -92,7 +92,7 @@ def rasterize_rows(name: str, look: Look, setup: Setup) -> Iterator[Row]:
         "blend": roofline.count_blend_backward(pairs, pixels, reached, blended),
     }
     totals = (sum(works.values(), Work(0, 0)), sum(backward_works.values(), Work(0, 0)))
-    yield from _timed_rows(name, size, call, totals, setup, crop)
+    yield from _measure_passes(name, size, call, totals, setup, crop)
     forward, backward = call.separate_tasks(setup.implementation)
     for pass_name, task, parts in (("forward", forward, works), ("backward", backward, backward_works)):
         measured = profile_task(task, 5, setup.torch_device).times
@@ -113,35 +113,35 @@ def rasterize_rows(name: str, look: Look, setup: Setup) -> Iterator[Row]:
             }
 
 
-def hash_encode_rows(setup: Setup) -> Iterator[Row]:
+def measure_hash_encode(setup: Setup) -> Iterator[Row]:
     """Measure the hash encoding of both fields for all Gaussians; gradients go to the table, as in training."""
     model = _model(setup)
     coords = model.cube_coords(model.gaussians.positions).detach()
-    for name, field in named_fields(model):
+    for name, field in list_named_fields(model):
         grid = field.grid.config
         # A trained table has values of about 0.1; the initial values of training are about 1e-4.
         numbers = 1e3 * field.grid.table.detach(), grid.resolutions, grid.log2_table_size
-        call, part = (hash_encode_call(points, *numbers) for points in (coords, _sample(coords, setup)))
+        call, part = (make_hash_encode_call(points, *numbers) for points in (coords, _sample(coords, setup)))
         sizes = len(coords), grid.levels, grid.rows
         works = roofline.count_hash_encode(*sizes), roofline.count_hash_encode_backward(*sizes)
         size = f"{len(coords):,} points, {grid.levels} levels, {grid.rows:,} rows"
-        yield from _timed_rows(f"hash encode, {name}", size, call, works, setup, part)
+        yield from _measure_passes(f"hash encode, {name}", size, call, works, setup, part)
 
 
-def mlp_rows(mixed: bool, setup: Setup) -> Iterator[Row]:
+def measure_mlp(mixed: bool, setup: Setup) -> Iterator[Row]:
     """Measure the decoders of both fields on all Gaussians."""
-    for name, field, x in decoder_inputs(_model(setup), torch.zeros(3)):
+    for name, field, x in iterate_decoder_inputs(_model(setup), torch.zeros(3)):
         x += 0.5 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0)).to(x.device)
-        call, part = (mlp_call(rows, field.weights, field.biases, mixed) for rows in (x, _sample(x, setup)))
+        call, part = (make_mlp_call(rows, field.weights, field.biases, mixed) for rows in (x, _sample(x, setup)))
         widths = [x.shape[1], *(weight.shape[0] for weight in field.weights)]
         works = roofline.count_mlp(len(x), widths, mixed), roofline.count_mlp_backward(len(x), widths, mixed)
         precision = "mixed" if mixed else "float32"
         size = f"{len(x):,} rows, {'-'.join(map(str, widths))}"
-        yield from _timed_rows(f"mlp, {name}, {precision}", size, call, works, setup, part)
+        yield from _measure_passes(f"mlp, {name}, {precision}", size, call, works, setup, part)
 
 
 @torch.no_grad()
-def decode_rows(setup: Setup) -> Iterator[Row]:
+def measure_decode(setup: Setup) -> Iterator[Row]:
     """Measure the decoding of all Gaussians' geometry and colours for a frame; the error includes all rounding."""
     model, camera = _model(setup), make_cameras(1, setup.width, setup.height)[0]
     viewpoint = torch.as_tensor(camera.position, dtype=torch.float32, device=setup.torch_device)
@@ -161,7 +161,7 @@ def decode_rows(setup: Setup) -> Iterator[Row]:
         "radiance": lambda: model.decode_colors(viewpoint),
     }
     times = median_ms(tasks, setup.repeats, setup.torch_device)
-    for name, field in named_fields(model):
+    for name, field in list_named_fields(model):
         widths = [field.weights[0].shape[1], *(weight.shape[0] for weight in field.weights)]
         mixed = model.precision == "mixed"
         work = roofline.count_decode(len(model), widths, field.grid.config.levels, field.grid.config.rows, mixed)
@@ -170,7 +170,7 @@ def decode_rows(setup: Setup) -> Iterator[Row]:
 
 
 @torch.no_grad()
-def shade_rows(setup: Setup) -> Iterator[Row]:
+def measure_shade(setup: Setup) -> Iterator[Row]:
     """Measure the colours of all Gaussians for a view, with the view-independent part computed beforehand."""
     model, camera = _model(setup), make_cameras(1, setup.width, setup.height)[0]
     positions = model.gaussians.positions.detach()
@@ -228,7 +228,7 @@ def _cast(shading: Shading, dtype: torch.dtype | None) -> Shading:
 
 
 @torch.no_grad()
-def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
+def measure_rasterize_shaded(setup: Setup) -> Iterator[Row]:
     """Measure culling, shading and rasterising in one call, as for frames of a fixed model.
 
     The error is that of a crop of the picture.
@@ -262,7 +262,7 @@ def rasterize_shaded_rows(setup: Setup) -> Iterator[Row]:
 
 
 @torch.no_grad()
-def background_rows(setup: Setup) -> Iterator[Row]:
+def measure_background(setup: Setup) -> Iterator[Row]:
     """Measure the background's grid at the window for a frame; the error includes all rounding."""
     model, camera = _model(setup), make_cameras(setup.views, setup.width, setup.height)[0]
     splats, defaults = decode_splats(model, camera), RenderSettings()
@@ -288,7 +288,7 @@ def background_rows(setup: Setup) -> Iterator[Row]:
         yield row | {"value error": error} | status_beyond(error, 1e-2 if mixed else 1e-3)
 
 
-def ssim_rows(setup: Setup) -> Iterator[Row]:
+def measure_ssim(setup: Setup) -> Iterator[Row]:
     """Measure the photometric loss and its gradient for a whole picture."""
     generator = torch.Generator().manual_seed(0)
     small = torch.rand(1, 3, max(1, setup.height // 20), max(1, setup.width // 20), generator=generator)
@@ -297,7 +297,7 @@ def ssim_rows(setup: Setup) -> Iterator[Row]:
     noise = 0.05 * torch.randn(*size, 3, generator=generator)
     pictures = [tensor.contiguous().to(setup.device) for tensor in ((smooth + noise).clamp(0, 1), smooth)]
 
-    call = loss_call(*pictures)
+    call = make_loss_call(*pictures)
     ms = median_ms({"both": call.forward_backward_task(setup.implementation)}, setup.repeats, setup.torch_device)[
         "both"
     ]
@@ -306,7 +306,7 @@ def ssim_rows(setup: Setup) -> Iterator[Row]:
     yield _row("SSIM and L1 loss", "both", size_text, ms, work, setup) | check_call(call, setup.implementation)
 
 
-def adam_rows(setup: Setup) -> Iterator[Row]:
+def measure_adam(setup: Setup) -> Iterator[Row]:
     """Measure one Adam step for as many parameters as the Gaussians have."""
     count = 8 * setup.kernel_gaussians
     generator = torch.Generator().manual_seed(0)
@@ -326,7 +326,7 @@ def adam_rows(setup: Setup) -> Iterator[Row]:
     yield row | {"value error": error} | status_beyond(error, 1e-5)
 
 
-def _timed_rows(
+def _measure_passes(
     name: str, size: str, call: OperationCall, works: Works, setup: Setup, part: OperationCall
 ) -> Iterator[Row]:
     """Yield the rows of both passes of a call; the errors are those of `part`, a smaller call."""
@@ -382,16 +382,16 @@ def _sample(rows: Tensor, setup: Setup) -> Tensor:
 # The kernels that are expected to take most of a step come first: the backward passes of hash encoding, of decoders and
 # of the rasteriser with its `sum_rows`.
 ITEM_ROW_GENERATORS: dict[str, Callable[[Setup], Iterator[Row]]] = {
-    "rates": rates_rows,
-    "hash encode": hash_encode_rows,
-    "mlp mixed": lambda setup: mlp_rows(True, setup),
-    "rasterize, as trained": partial(rasterize_rows, "rasterize, as trained", TRAINED_LOOK),
-    "rasterize": partial(rasterize_rows, "rasterize", TIDY_LOOK),
-    "rasterize shaded": rasterize_shaded_rows,
-    "shade": shade_rows,
-    "background": background_rows,
-    "loss": ssim_rows,
-    "adam": adam_rows,
-    "decode": decode_rows,
-    "mlp float32": lambda setup: mlp_rows(False, setup),
+    "rates": measure_peak_rates,
+    "hash encode": measure_hash_encode,
+    "mlp mixed": lambda setup: measure_mlp(True, setup),
+    "rasterize, as trained": partial(measure_rasterize, "rasterize, as trained", TRAINED_LOOK),
+    "rasterize": partial(measure_rasterize, "rasterize", TIDY_LOOK),
+    "rasterize shaded": measure_rasterize_shaded,
+    "shade": measure_shade,
+    "background": measure_background,
+    "loss": measure_ssim,
+    "adam": measure_adam,
+    "decode": measure_decode,
+    "mlp float32": lambda setup: measure_mlp(False, setup),
 }

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hyrfpack.bench.operation_calls import splat_inputs
+from hyrfpack.bench.operation_calls import collect_splat_inputs
 from hyrfpack.cameras.paths import look_at
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
@@ -139,7 +139,7 @@ class Splats:
 def decode_splats(model: HybridModel, camera: Camera) -> Splats:
     """Decode all Gaussians of the model for one view."""
     viewport = model.config.frame.local_viewport(camera, torch.float64)
-    inputs = splat_inputs(model, camera_center(viewport.pose))
+    inputs = collect_splat_inputs(model, camera_center(viewport.pose))
     return Splats({name: tensor.contiguous() for name, tensor in inputs.items()}, viewport)
 
 

@@ -7,7 +7,13 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-from hyrfpack.bench.operation_calls import OperationCall, hash_encode_call, loss_call, mlp_call, rasterize_call
+from hyrfpack.bench.operation_calls import (
+    OperationCall,
+    make_hash_encode_call,
+    make_loss_call,
+    make_mlp_call,
+    make_rasterize_call,
+)
 from hyrfpack.ops.hash_encode import level_offsets, level_resolutions
 from hyrfpack.ops.rasterize import RasterSettings
 from hyrfpack.ops.viewport import Viewport
@@ -61,7 +67,7 @@ def _rasterize(
         pose = torch.eye(4, dtype=torch.float64)
         viewport = Viewport(pose, (width, width, width / 2, height / 2), width, height)
         placed = {name: tensor.to(device) for name, tensor in inputs.items()}
-        return rasterize_call(placed, viewport, RasterSettings(antialiased=antialiased))
+        return make_rasterize_call(placed, viewport, RasterSettings(antialiased=antialiased))
 
     return make
 
@@ -72,7 +78,7 @@ def _hash_encode(points: int, log2: int, gradient_inputs: tuple[str, ...]) -> Ca
         # Coordinates have 16 bits, so that a point has the same cell and offset in every precision.
         coords = torch.randint(0, 1 << 16, (points, 3), generator=torch.Generator().manual_seed(0)) / (1 << 16)
         table = _random_normal(1, level_offsets(resolutions, log2)[-1], 2)
-        return hash_encode_call(coords.to(device), table.to(device), resolutions, log2, gradient_inputs)
+        return make_hash_encode_call(coords.to(device), table.to(device), resolutions, log2, gradient_inputs)
 
     return make
 
@@ -83,7 +89,7 @@ def _mlp(rows: int, widths: tuple[int, ...], mixed: bool) -> Callable[[torch.dev
         shapes = enumerate(zip(widths[1:], widths, strict=False))
         weights = [(_random_normal(layer + 1, o, i) / i**0.5).to(device) for layer, (o, i) in shapes]
         biases = [(0.1 * _random_normal(layer + 9, width)).to(device) for layer, width in enumerate(widths[1:])]
-        return mlp_call(x, weights, biases, mixed)
+        return make_mlp_call(x, weights, biases, mixed)
 
     return make
 
@@ -93,7 +99,7 @@ def _loss(height: int, width: int, share: float | None) -> Callable[[torch.devic
         target = torch.sigmoid(_random_normal(0, height, width, 3))
         image = (target + 0.1 * _random_normal(1, height, width, 3)).clamp(0, 1)
         mask = None if share is None else (_random_normal(2, height, width).sigmoid() < share).to(device)
-        return loss_call(image.to(device), target.to(device), mask)
+        return make_loss_call(image.to(device), target.to(device), mask)
 
     return make
 

@@ -31,7 +31,7 @@ from hyrfpack.compress import CompressionReport
 from hyrfpack.compress.plan import make_plan
 from hyrfpack.compress.quantize import quantize
 from hyrfpack.compress.sensitivity import Sensitivity
-from hyrfpack.evaluate.figures import blank_figure
+from hyrfpack.evaluate.figures import make_blank_figure
 from hyrfpack.format.codec import PROFILES
 from hyrfpack.format.compact.groups import encode_groups
 from hyrfpack.format.compact.quantized import QuantizedModel
@@ -133,7 +133,7 @@ def resized(camera: Camera, size: int) -> Camera:
 
 
 @torch.no_grad()
-def without_field(model: HybridModel, *names: str) -> HybridModel:
+def silence_fields(model: HybridModel, *names: str) -> HybridModel:
     """Return a copy of a model in which the named fields ("geometry", "radiance") predict 0 everywhere."""
     copy = deepcopy(model)
     for name in names:
@@ -144,9 +144,9 @@ def without_field(model: HybridModel, *names: str) -> HybridModel:
 
 
 @torch.no_grad()
-def as_dots(model: HybridModel) -> HybridModel:
+def show_as_dots(model: HybridModel) -> HybridModel:
     """Return a copy of a model whose Gaussians are small opaque dots in their stored colours."""
-    copy = without_field(model, "geometry", "radiance")
+    copy = silence_fields(model, "geometry", "radiance")
     copy.config = replace(copy.config, scale_grows=False)
     copy.gaussians.scale_logits.fill_(float(logit(torch.tensor(DOT_SCALE_LOCAL))))
     copy.gaussians.opacity_logits.fill_(4.0)
@@ -156,9 +156,9 @@ def as_dots(model: HybridModel) -> HybridModel:
 def render_stages(model: HybridModel, camera: Camera) -> list[tuple[str, np.ndarray]]:
     """Render one view with the parts of the model added one after another; return captions and pictures."""
     stages = [
-        ("stored positions\nand colours", as_dots(model), False),
-        ("+ stored scales\nand opacities", without_field(model, "geometry", "radiance"), False),
-        ("+ geometry field", without_field(model, "radiance"), False),
+        ("stored positions\nand colours", show_as_dots(model), False),
+        ("+ stored scales\nand opacities", silence_fields(model, "geometry", "radiance"), False),
+        ("+ geometry field", silence_fields(model, "radiance"), False),
         ("+ radiance field", model, False),
         ("+ background sphere", model, True),
     ]
@@ -170,7 +170,7 @@ def render_stages(model: HybridModel, camera: Camera) -> list[tuple[str, np.ndar
 
 def draw_method(model: HybridModel, camera: Camera, path: Path) -> Path:
     """Draw how a Gaussian's properties are computed, and one view with the parts of the model added one by one."""
-    figure = blank_figure(FIGURE_WIDTH_INCHES, 5.1, layout=None)
+    figure = make_blank_figure(FIGURE_WIDTH_INCHES, 5.1, layout=None)
     axes = figure.add_axes((0.005, 0.43, 0.99, 0.565))
     axes.set(xlim=(-0.5, 100.5), ylim=(0, 36))
     axes.axis("off")
@@ -263,17 +263,17 @@ def arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float]) -> N
 
 def draw_file(files: dict[str, Path], path: Path) -> Path:
     """Draw the header, an entry of the table of contents, and the sections of the three profiles by their bytes."""
-    figure = blank_figure(FIGURE_WIDTH_INCHES, 5.0, layout=None)
+    figure = make_blank_figure(FIGURE_WIDTH_INCHES, 5.0, layout=None)
     axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
     axes.set(xlim=(0, 100), ylim=(0, 64))
     axes.axis("off")
     data = files["compact"].read_bytes()
     axes.text(0, 62.5, "Header: 48 bytes", fontsize=9.5, weight="bold", color=TEXT_COLOR, va="center")
-    draw_fields(axes, 53, header_fields(data))
+    draw_fields(axes, 53, read_header_fields(data))
     axes.text(
         0, 49.5, "Table of contents: 40 bytes for each section, here POSI", fontsize=9.5, weight="bold", va="center"
     )
-    draw_fields(axes, 40, entry_fields(data, POSITIONS))
+    draw_fields(axes, 40, read_entry_fields(data, POSITIONS))
 
     sections = {profile: read_sizes(file) for profile, file in files.items()}
     axes.text(0, 35.8, "Sections of a file of profile compact", fontsize=9.5, weight="bold", va="center")
@@ -288,7 +288,7 @@ def draw_file(files: dict[str, Path], path: Path) -> Path:
     return save_png(figure, path)
 
 
-def header_fields(data: bytes) -> list[tuple[int, str, str]]:
+def read_header_fields(data: bytes) -> list[tuple[int, str, str]]:
     """Return the fields of a file's header: bytes, name and value."""
     _, major, minor, flags, length, start, toc_length, count, toc_sum = struct.unpack_from("<8sHHIQQIII", data)
     (header_sum,) = struct.unpack_from("<I", data, 44)
@@ -305,7 +305,7 @@ def header_fields(data: bytes) -> list[tuple[int, str, str]]:
     ]
 
 
-def entry_fields(data: bytes, tag: str) -> list[tuple[int, str, str]]:
+def read_entry_fields(data: bytes, tag: str) -> list[tuple[int, str, str]]:
     """Return the fields of a section's entry in the table of contents: bytes, name and value."""
     (count,) = struct.unpack_from("<I", data, 36)
     for number in range(count):
@@ -331,7 +331,7 @@ def draw_fields(axes: Axes, bottom: float, fields: Sequence[tuple[int, str, str]
     left = 0.0
     for length, name, value in fields:
         width = 100 * length / 48
-        axes.add_patch(rectangle_of((left, bottom, width, 7), STORED_COLOR))
+        axes.add_patch(make_rectangle((left, bottom, width, 7), STORED_COLOR))
         axes.text(left + width / 2, bottom + 4.9, name, fontsize=8, color=TEXT_COLOR, ha="center", va="center")
         axes.text(
             left + width / 2,
@@ -368,15 +368,17 @@ def draw_bar(
     labels: bool = False,
 ) -> float:
     """Draw the sections of a file as a bar and return its right end; labels name the sections and their bytes."""
-    total, above = sum(parts.values()), False
+    total, is_label_above = sum(parts.values()), False
     for group, size in parts.items():
         part = width * size / total
-        axes.add_patch(rectangle_of((left, bottom, part, height), SECTION_COLORS.get(group, SECTION_COLORS[METADATA])))
+        axes.add_patch(
+            make_rectangle((left, bottom, part, height), SECTION_COLORS.get(group, SECTION_COLORS[METADATA]))
+        )
         if labels and group != CONTAINER_GROUP:
-            above = not above
+            is_label_above = not is_label_above
             axes.text(
                 min(max(left + part / 2, SECTION_LABEL_WIDTH_PERCENT / 2), 100 - SECTION_LABEL_WIDTH_PERCENT / 2),
-                bottom + height + 2.6 if above else bottom - 2.6,
+                bottom + height + 2.6 if is_label_above else bottom - 2.6,
                 f"{group}\n{size / 1000:.1f} kB",
                 fontsize=7.5,
                 color=TEXT_COLOR,
@@ -387,7 +389,7 @@ def draw_bar(
     return left
 
 
-def rectangle_of(rectangle: tuple[float, float, float, float], color: str) -> Any:
+def make_rectangle(rectangle: tuple[float, float, float, float], color: str) -> Any:
     """Return a filled rectangle (left, bottom, width, height) with a thin edge."""
     from matplotlib.patches import Rectangle
 
@@ -407,7 +409,7 @@ def draw_codec(model: HybridModel, report: CompressionReport, file: Path, path: 
     planned = plan.apply(model)
     chosen, nearest = (quantize(planned, plan, sensitivity, reach=reach) for reach in (1, 0))
 
-    figure = blank_figure(FIGURE_WIDTH_INCHES, 6.4)
+    figure = make_blank_figure(FIGURE_WIDTH_INCHES, 6.4)
     panels = figure.subplots(2, 2)
     draw_sensitivities(panels[0, 0], sensitivity)
     draw_steps(panels[0, 1], chosen, sensitivity)
@@ -425,21 +427,23 @@ def draw_codec(model: HybridModel, report: CompressionReport, file: Path, path: 
 
 def draw_sensitivities(axes: Axes, sensitivity: Sensitivity) -> None:
     """Draw the distribution of sensitivities of each kind of number."""
-    kinds = {
+    sensitivities_by_section = {
         POSITIONS: sensitivity.positions,
         COLORS: sensitivity.colors,
         OPACITIES: sensitivity.opacities,
         RADIANCE_TABLE: sensitivity.fields[RADIANCE_TABLE],
         RADIANCE_DECODER: sensitivity.fields[RADIANCE_DECODER],
     }
-    logs = {group: np.log10(values[values > MAX_UNREAD_SENSITIVITY]) for group, values in kinds.items()}
+    logs = {
+        group: np.log10(values[values > MAX_UNREAD_SENSITIVITY]) for group, values in sensitivities_by_section.items()
+    }
     low, high = np.percentile(
         np.concatenate([np.percentile(values, (1, 99)) for values in logs.values() if len(values)]), (0, 100)
     )
     bins = np.linspace(low - 1, high + 1, 60)
     for group, values in logs.items():
         shares = np.histogram(values, bins)[0] * (100 / max(len(values), 1))
-        axes.stairs(shares, bins, color=SECTION_COLORS[group], linewidth=1.6, label=label_of(group))
+        axes.stairs(shares, bins, color=SECTION_COLORS[group], linewidth=1.6, label=choose_legend_label(group))
     axes.set(title="1  Sensitivity of each number", xlabel="log10 of s", ylabel="share of the numbers (%)")
     axes.legend(fontsize=8, frameon=False, loc="upper left")
 
@@ -447,21 +451,25 @@ def draw_sensitivities(axes: Axes, sensitivity: Sensitivity) -> None:
 def draw_steps(axes: Axes, quantized: QuantizedModel, sensitivity: Sensitivity) -> None:
     """Draw the step of each class and group over its mean sensitivity, beside the rule sqrt(12 D / s)."""
     plan = quantized.plan
-    kept = sensitivity.subset(plan.kept)
+    kept_sensitivity = sensitivity.subset(plan.kept)
     classes = np.concatenate([layer.points.classes for layer in plan.layers])
     points: dict[str, list[tuple[float, float]]] = {}
     for kind in np.unique(classes):
         members = classes == kind
         layer = next(number for number, layer in enumerate(plan.layers) if (layer.points.classes == kind).any())
         bits = plan.layers[layer].points.bits[kind]
-        points.setdefault(POSITIONS, []).append((kept.positions[members].mean(), 2.0**-bits))
-        for group, values in ((COLORS, kept.colors), (SCALES, kept.scales), (OPACITIES, kept.opacities)):
+        points.setdefault(POSITIONS, []).append((kept_sensitivity.positions[members].mean(), 2.0**-bits))
+        for group, values in (
+            (COLORS, kept_sensitivity.colors),
+            (SCALES, kept_sensitivity.scales),
+            (OPACITIES, kept_sensitivity.opacities),
+        ):
             code = quantized.channels[layer][group][0].codes[kind]
             points.setdefault(group, []).append((values[members].mean(), decode_step(code) / FIXED_POINT_ONE))
     for group, symbols in quantized.groups.items():
         index = plan.groups[group].index
         counts = np.maximum(np.bincount(index, minlength=len(symbols.codes)), 1)
-        means = np.bincount(index, kept.fields[group], len(symbols.codes)) / counts
+        means = np.bincount(index, kept_sensitivity.fields[group], len(symbols.codes)) / counts
         for mean, code in zip(means, symbols.codes, strict=True):
             if code != ALL_ZERO_CODE:
                 points.setdefault(group, []).append((mean, decode_step(code) / FIXED_POINT_ONE))
@@ -513,20 +521,20 @@ def draw_shares(axes: Axes, report: CompressionReport, file: Path) -> None:
         rows + 0.2, [100 * size / total for size in sizes.values()], 0.4, color=[SECTION_COLORS[g] for g in sizes]
     )
     axes.barh(rows - 0.2, [100 * report.shares.get(group, 0) for group in sizes], 0.4, color="#bdc1c6")
-    axes.set_yticks(rows, [label_of(group) for group in sizes])
+    axes.set_yticks(rows, [choose_legend_label(group) for group in sizes])
     axes.set(title="4  Bytes (colour) and error (grey)", xlabel="share of the whole (%)")
 
 
-def label_of(group: str) -> str:
+def choose_legend_label(group: str) -> str:
     """Return the content of a section as a short text for a legend."""
     return SECTION_CONTENTS[group].replace(" logits", "s").replace("opacitys", "opacities").replace(" hash", "")
 
 
 def save_png(figure: Any, path: Path) -> Path:
     """Write a figure as a PNG of 256 colours on white."""
-    drawn, data = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, dpi=120, format="png", facecolor="white")
-    picture = Image.open(drawn).convert("RGB")
+    rendered, data = io.BytesIO(), io.BytesIO()
+    figure.savefig(rendered, dpi=120, format="png", facecolor="white")
+    picture = Image.open(rendered).convert("RGB")
     palette = picture.quantize(255)
     palette.putpalette([*(palette.getpalette() or [])[: 3 * 255], 255, 255, 255])
     reduced = picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)

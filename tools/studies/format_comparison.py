@@ -33,7 +33,7 @@ from torch import Tensor
 
 import hyrfpack
 from hyrfpack.choices import SPZ_VERSIONS
-from hyrfpack.evaluate.figures import blank_figure, save_figure
+from hyrfpack.evaluate.figures import make_blank_figure, save_figure
 from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
 from hyrfpack.export.bake import bake
 from hyrfpack.export.kinds import select_splats
@@ -106,14 +106,14 @@ class HeldOutView:
         camera: the camera.
         photo: (H, W, 3) photo.
         mask: (H, W) bool, the pixels to score, or None.
-        behind: (H, W, 3) background of the trained model.
+        background: (H, W, 3) background of the trained model.
         trained: (H, W, 3) picture of the trained model, rounded to 8 bits.
     """
 
     camera: Camera
     photo: Tensor
     mask: Tensor | None
-    behind: Tensor
+    background: Tensor
     trained: Tensor
 
 
@@ -146,7 +146,7 @@ def _background(model: HybridModel, camera: Camera) -> Tensor:
 def draw_over_background(splats: Drawable, view: HeldOutView) -> Tensor:
     """Draw splats over the trained model's background; return (H, W, 3)."""
     raster = draw(splats, view.camera)
-    return raster.rgb + raster.transmittance[..., None] * view.behind
+    return raster.rgb + raster.transmittance[..., None] * view.background
 
 
 def score_pictures(pictures: Iterable[Tensor], views: Sequence[HeldOutView]) -> tuple[float, float, float]:
@@ -188,7 +188,7 @@ def round_trip(ending: str, hints: Hints, splats: Splats) -> tuple[int, Splats]:
     return len(data), FORMATS[ending].decode(data, ending)
 
 
-def round_trips_of_peer(peer: str, degree: int) -> dict[str, RoundTrip]:
+def list_round_trips(peer: str, degree: int) -> dict[str, RoundTrip]:
     """Return the round trips of another format by the name of the encoder's setting."""
     if peer == "SPZ":
         return {f"version {v}": partial(round_trip, ".spz", Hints(spz_version=v)) for v in SPZ_VERSIONS}
@@ -202,7 +202,7 @@ def round_trips_of_peer(peer: str, degree: int) -> dict[str, RoundTrip]:
 def iterate_settings(peer: str) -> Iterator[PeerSetting]:
     """Yield all settings of another format."""
     for degree, min_opacity in product(SH_DEGREES, MIN_OPACITIES):
-        for name, run in round_trips_of_peer(peer, degree).items():
+        for name, run in list_round_trips(peer, degree).items():
             yield PeerSetting(peer, name, degree, min_opacity, run)
 
 
@@ -234,8 +234,8 @@ class Measurements:
 
     def measure_peer(self, setting: PeerSetting) -> MeasuredFile:
         """Encode, decode, draw and score a file of another format."""
-        size, read = setting.run(select_splats(self.baked[setting.degree], None, setting.min_opacity))
-        return self._row(setting.peer, str(setting), size, len(read), self.score_splats(read), setting.degree)
+        size, decoded = setting.run(select_splats(self.baked[setting.degree], None, setting.min_opacity))
+        return self._row(setting.peer, str(setting), size, len(decoded), self.score_splats(decoded), setting.degree)
 
     def measure_own_file(self, path: Path, setting: str) -> MeasuredFile:
         """Load, render and score a `.hyrf` file."""
@@ -248,7 +248,7 @@ class Measurements:
         return self._row(f"hyrfpack {profile}", setting, path.stat().st_size, len(model), scores)
 
 
-def compress_with_profiles(trained: Path, given: Sequence[Path], folder: Path) -> Iterator[tuple[Path, str]]:
+def compress_with_profiles(trained: Path, other_files: Sequence[Path], folder: Path) -> Iterator[tuple[Path, str]]:
     """Compress the model with all profiles into `folder`; yield these files and the given ones with their settings."""
     for profile in PROFILES:
         for number, settings in enumerate(PROFILE_SETTINGS.get(profile, [{}])):
@@ -260,7 +260,7 @@ def compress_with_profiles(trained: Path, given: Sequence[Path], folder: Path) -
                     config = hyrfpack.CompressConfig(profile=profile, **settings)
                 hyrfpack.compress_model(trained, path, config)
                 yield path, ", ".join(f"{name} {value}" for name, value in settings.items()) or "default"
-    for path in given:
+    for path in other_files:
         yield path, path.stem
 
 
@@ -269,7 +269,7 @@ def group_by_format(rows: Sequence[MeasuredFile]) -> dict[str, list[MeasuredFile
     return {name: [row for row in rows if row.format == name] for name in dict.fromkeys(row.format for row in rows)}
 
 
-def pareto_front(rows: Sequence[MeasuredFile]) -> list[MeasuredFile]:
+def find_pareto_front(rows: Sequence[MeasuredFile]) -> list[MeasuredFile]:
     """Return the rows with a higher PSNR than all smaller files, sorted by bytes."""
     best: list[MeasuredFile] = []
     for row in sorted(rows, key=lambda row: (row.bytes, -row.psnr)):
@@ -296,10 +296,10 @@ def format_table(rows: Sequence[MeasuredFile], trained: int) -> str:
 
 def plot(rows: Sequence[MeasuredFile], trained: float, baked: float, title: str, path: Path) -> None:
     """Plot PSNR against bytes: the Pareto front of each format as a line, its other settings as faint dots."""
-    figure = blank_figure(8, 5.5)
+    figure = make_blank_figure(8, 5.5)
     axes = figure.subplots()
     for (name, format_rows), color in zip(group_by_format(rows).items(), cycle(FORMAT_COLORS), strict=False):
-        front = pareto_front(format_rows)
+        front = find_pareto_front(format_rows)
         axes.scatter(
             [row.bytes for row in format_rows],
             [row.psnr for row in format_rows],
@@ -363,7 +363,7 @@ def main() -> None:
         rows.append(measure.measure_peer(setting))
         write_report(out / "peers.json", measure, rows)
         print(f"{number + 1}/{len(settings)} {format_table(rows[-1:], len(model)).splitlines()[-1]}", flush=True)
-    best = [row for format_rows in group_by_format(rows).values() for row in pareto_front(format_rows)]
+    best = [row for format_rows in group_by_format(rows).values() for row in find_pareto_front(format_rows)]
     print(f"\nThe settings that no smaller file of the same format equals:\n\n{format_table(best, len(model))}")
     write_report(out / "peers.json", measure, rows)
     title = f"{args.data.name}: {len(model):,} Gaussians (peers without the bytes of the background)"
