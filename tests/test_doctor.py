@@ -128,5 +128,5 @@ def test_a_gpu_is_described_and_its_result_stored(monkeypatch, tmp_path):
 @pytest.mark.acceptance
 def test_the_worker_of_the_self_test_can_be_started_from_any_folder(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("hyrfpack.self_test.run.self_test_cases", dict)
+    monkeypatch.setattr("hyrfpack.self_test.run.list_self_test_cases", dict)
     assert run_self_test("cpu", torch.device("cpu")) == SelfTest("cpu", "cpu", ())

@@ -192,11 +192,12 @@ def read_scene(
     return scene
 
 
-def note_rename(asked: Path, written: Path | str) -> Path:
+def note_rename(requested: Path, written_path: Path | str) -> Path:
     """Return the path that was written, and print a note if another one was requested."""
-    if os.path.realpath(written) != os.path.realpath(asked):  # `make` gives the full path of an output such as ".."
-        note(describe_rename(asked, written))
-    return Path(written)
+    # Real paths are compared, because `make` gives the full path of an output such as "..".
+    if os.path.realpath(written_path) != os.path.realpath(requested):
+        note(describe_rename(requested, written_path))
+    return Path(written_path)
 
 
 def resolve_model_file(path: Path) -> Path:
@@ -237,8 +238,8 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         cells = [line[0] + gaps[0], *(gap + cell for cell, gap in zip(line[1:], gaps[1:], strict=True))]
         return "  ".join(cells).rstrip()
 
-    first, *others = map(align, lines)
-    return "\n".join([first, "  ".join("-" * width for width in widths), *others])
+    aligned_header, *aligned_rows = map(align, lines)
+    return "\n".join([aligned_header, "  ".join("-" * width for width in widths), *aligned_rows])
 
 
 def _display_width(text: str) -> int:

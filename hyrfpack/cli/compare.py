@@ -27,14 +27,14 @@ def compare(runs: tuple[Path, ...], output: Path, overwrite: bool, as_json: bool
       hyrfpack compare runs/a runs/b -o comparison.html
       hyrfpack compare runs/* -o comparison.html --overwrite
     """
-    from hyrfpack.report import compare_runs as run
+    from hyrfpack.report import compare_runs
 
-    report = run(runs, output, overwrite=overwrite)
+    report = compare_runs(runs, output, overwrite=overwrite)
     for sentence in report.doubts:
         note(sentence)
-    written = note_rename(output, report.file)
+    written_path = note_rename(output, report.file)
     if as_json:
         print_json(asdict(report))
         return
     views = f"{len(report.views)} held-out view{'' if len(report.views) == 1 else 's'}"
-    click.echo(f"{written}: {len(report.runs)} runs, {views}, {report.bytes:,} bytes; open it in a browser")
+    click.echo(f"{written_path}: {len(report.runs)} runs, {views}, {report.bytes:,} bytes; open it in a browser")

@@ -91,7 +91,7 @@ def compress(
     """
     if data is not None and no_data:
         raise click.UsageError("--data and --no-data contradict each other; give one of them")
-    from hyrfpack.compress import compress_model as pack
+    from hyrfpack.compress import compress_model
     from hyrfpack.context import RunContext
     from hyrfpack.format import describe_file
     from hyrfpack.progress import open_display, part_of_progress
@@ -116,7 +116,7 @@ def compress(
 
     scene = ranks.run_on_all(read)
     with open_display("auto", "compress") as progress:
-        result = pack(
+        result = compress_model(
             model,
             output,
             config,
@@ -128,13 +128,15 @@ def compress(
             return
         files = model, Path(result.file)
         scores = _score_both_files(*files, scene, torch_device, part_of_progress(progress, 0.9, 1.0))
-    written = note_rename(output, result.file)
+    written_path = note_rename(output, result.file)
     page = None
     if report is not None:
         from hyrfpack.report.compression import write_compression_report
 
         command = _command_as_typed(click.get_current_context())
-        page = write_compression_report(report, model, written, result, scene, command=command, overwrite=overwrite)
+        page = write_compression_report(
+            report, model, written_path, result, scene, command=command, overwrite=overwrite
+        )
     if as_json:
         print_json({**result.to_dict(), **scores, **({} if page is None else {"report": str(page)})})
         return
@@ -211,7 +213,7 @@ def _load_training_photos(model: Path) -> Scene | None:
 
 
 def _score_both_files(
-    before: Path, after: Path, scene: Scene | None, device: torch.device, progress: Progress
+    source: Path, packed: Path, scene: Scene | None, device: torch.device, progress: Progress
 ) -> dict[str, float]:
     """Return mean PSNR and SSIM of both files on the held-out photos; empty if there are none."""
     if scene is None or not scene.test:
@@ -220,11 +222,16 @@ def _score_both_files(
     from hyrfpack.format.parts import load_model_or_parts
     from hyrfpack.progress import part_of_progress
 
-    old, new = (
+    source_scores, packed_scores = (
         evaluate_model(load_model_or_parts(file).to(device), scene.test, progress=part_of_progress(progress, *shares))
-        for file, shares in ((before, (0.0, 0.5)), (after, (0.5, 1.0)))
+        for file, shares in ((source, (0.0, 0.5)), (packed, (0.5, 1.0)))
     )
-    return {"psnr_before": old.psnr, "psnr": new.psnr, "ssim_before": old.ssim, "ssim": new.ssim}
+    return {
+        "psnr_before": source_scores.psnr,
+        "psnr": packed_scores.psnr,
+        "ssim_before": source_scores.ssim,
+        "ssim": packed_scores.ssim,
+    }
 
 
 def _print_file(report: FileReport, shares: dict[str, float] | None = None) -> None:

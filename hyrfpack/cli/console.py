@@ -36,9 +36,9 @@ def add_verbosity_options(command: click.Command) -> None:
         )
 
 
-def _set_verbosity(ctx: click.Context, option: click.Parameter, given: bool) -> None:
+def _set_verbosity(ctx: click.Context, option: click.Parameter, is_given: bool) -> None:
     """Apply --quiet or --verbose, as the callback of these options."""
-    if not given or ctx.resilient_parsing or ctx.meta.get(_VERBOSITY_KEY) == option.name:
+    if not is_given or ctx.resilient_parsing or ctx.meta.get(_VERBOSITY_KEY) == option.name:
         return
     root = ctx.find_root()
     if _VERBOSITY_KEY in ctx.meta:
@@ -57,11 +57,11 @@ def _versions() -> str:
     """Return the versions of hyrfpack, Python and the packages that matter in a bug report."""
     from importlib.metadata import PackageNotFoundError, version
 
-    known = [f"hyrfpack {__version__}", f"Python {platform.python_version()}"]
+    versions = [f"hyrfpack {__version__}", f"Python {platform.python_version()}"]
     for package in _REPORTED_PACKAGES:
         with suppress(PackageNotFoundError):
-            known.append(f"{package} {version(package)}")
-    return ", ".join(known)
+            versions.append(f"{package} {version(package)}")
+    return ", ".join(versions)
 
 
 def store_arguments(ctx: click.Context, arguments: Iterable[str]) -> None:

@@ -44,9 +44,9 @@ def convert(
       hyrfpack convert scene.ply small.sog --sh-degree 1 --min-opacity 0.02
       hyrfpack convert scene.spz table.ply --crop -1,-1,-1,1,1,1
     """
-    from hyrfpack.export.conversion import convert_splats as run
+    from hyrfpack.export.conversion import convert_splats
 
-    report = run(source, target, ConvertConfig(**settings), overwrite=overwrite)
+    report = convert_splats(source, target, ConvertConfig(**settings), overwrite=overwrite)
     note_rename(target, report.file)
     if as_json:
         print_json(report.to_dict())
@@ -55,9 +55,11 @@ def convert(
 
 
 def _print_report(source: Path, report: ConversionReport) -> None:
-    before = [source.name, f"{report.gaussians_before:,}", str(report.degree_before), f"{report.bytes_before:,}"]
-    after = [Path(report.file).name, f"{report.gaussians_after:,}", str(report.degree_after), f"{report.bytes_after:,}"]
-    click.echo(format_table(["file", "Gaussians", "SH degree", "bytes"], [before, after]))
+    rows = [
+        [source.name, f"{report.gaussians_before:,}", str(report.degree_before), f"{report.bytes_before:,}"],
+        [Path(report.file).name, f"{report.gaussians_after:,}", str(report.degree_after), f"{report.bytes_after:,}"],
+    ]
+    click.echo(format_table(["file", "Gaussians", "SH degree", "bytes"], rows))
     click.echo(
         f"PSNR against renders of {source.name}, {report.views} views: mean {report.psnr:.2f} dB, worst "
         f"{report.psnr_worst:.2f} dB"

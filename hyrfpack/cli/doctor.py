@@ -46,7 +46,7 @@ def doctor(device: str, as_json: bool) -> None:
 
 def _format_report(report: MachineReport) -> list[str]:
     """Return the report as lines of text."""
-    versions = [f"{name} {found or 'is not installed'}" for name, found in report.versions.items()]
+    versions = [f"{name} {version or 'is not installed'}" for name, version in report.versions.items()]
     lines = [", ".join(versions), report.system]
     memory = "unknown memory" if report.memory_bytes is None else f"{report.memory_bytes / 2**30:.1f} GiB of memory"
     lines.append(f"CPU: {report.cpu}, {format_count(report.cores, 'core')}, {memory}")

@@ -253,7 +253,7 @@ def edit(
     scene = None
     if data is not None:
         facts = describe_file(model)
-        edited = next((each for each in facts.get("parts", []) if each["name"] == part), facts)
+        edited = next((entry for entry in facts.get("parts", []) if entry["name"] == part), facts)
         scene = read_scene(data, reader_options, edited, must_match=True)
     if plan:
         report = plan_edit(model, actions, part=part, data=scene, picture=picture, overwrite=overwrite)

@@ -66,25 +66,24 @@ def evaluate(
       hyrfpack evaluate bonsai.hyrf --data photos/bonsai --pictures compare --json
       hyrfpack evaluate bonsai.ply --data photos/bonsai
     """
-    from hyrfpack.evaluate import evaluate_model as score
-    from hyrfpack.evaluate import picture_names
+    from hyrfpack.evaluate import evaluate_model, picture_names
     from hyrfpack.progress import open_display
 
     ranks, source = drawing.ranks, drawing.open(model)
 
     def read() -> tuple[HybridModel | MergedModel | Drawable, Scene, list[View]]:
-        shown = source.load()
+        drawn_model = source.load()
         scene = read_scene(data, reader_options, source.facts)
         views = select_views(scene, split)
         if pictures is not None:
             outputs = Outputs(source.path, lpips_weights, folder=source.folder, scene=scene, overwrite=overwrite)
             outputs.folder(pictures, picture_names(views).values())
-        return shown, scene, views
+        return drawn_model, scene, views
 
-    shown, scene, views = ranks.run_on_all(read)
+    drawn_model, scene, views = ranks.run_on_all(read)
     with open_display("auto", "evaluate") as progress:
-        scores = score(
-            shown,
+        scores = evaluate_model(
+            drawn_model,
             views,
             lpips_weights=lpips_weights,
             settings=drawing.settings,

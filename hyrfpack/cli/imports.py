@@ -71,12 +71,12 @@ def import_(
     config = ImportConfig(**settings)
     check_target(source, output, cameras, overwrite=overwrite)  # before the cameras are read
     cameras = cameras or _find_training_cameras(source)
-    given, scene = (None, None) if cameras is None else _read_cameras(cameras)
+    known_cameras, scene = (None, None) if cameras is None else _read_cameras(cameras)
     check_target(source, output, cameras, scene=scene, overwrite=overwrite)
     torch_device = choose_command_device(device)
     context = RunContext(device=torch_device)
-    report = import_splats(source, output, config, cameras=given, overwrite=overwrite, context=context)
-    written = note_rename(output, report.file)
+    report = import_splats(source, output, config, cameras=known_cameras, overwrite=overwrite, context=context)
+    written_path = note_rename(output, report.file)
     if as_json:
         print_json(report.to_dict())
         return
@@ -88,7 +88,7 @@ def import_(
             _format_ratio(report, report.bytes_source),
         ],
         ["as PLY", f"{report.gaussians_before:,}", f"{report.bytes_ply:,}", _format_ratio(report, report.bytes_ply)],
-        [written.name, f"{report.gaussians_after:,}", f"{report.bytes_after:,}", ""],
+        [written_path.name, f"{report.gaussians_after:,}", f"{report.bytes_after:,}", ""],
     ]
     click.echo(format_table(["file", "Gaussians", "bytes", "smaller by"], rows))
     click.echo(

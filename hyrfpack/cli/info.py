@@ -134,7 +134,7 @@ def _print_scene(path: Path, as_json: bool) -> None:
         items = [chunk["levels"][level] for chunk in scene["chunks"] if level < len(chunk["levels"])]
         sums = [sum(item[key] for item in items) for key in ("gaussians", "bytes")]
         means = [
-            sum(item["errors"][place] for item in items) / len(items) for place in range(len(scene["error_radii"]))
+            sum(item["errors"][number] for item in items) / len(items) for number in range(len(scene["error_radii"]))
         ]
         rows.append([f"level {level}", *(f"{value:,}" for value in sums), *(f"{mean:.1e}" for mean in means)])
     head = ["files", "Gaussians", "bytes", *(f"MSE at {radius:g} px" for radius in scene["error_radii"])]

@@ -97,8 +97,8 @@ def make(
                 context=RunContext(device=torch_device),
             )
     except Stopped as stop:
-        so_far = f"; the scene so far: {stop.preview}" if stop.preview else ""
-        note(f"stopped in {stop.stage}; the same command resumes{so_far}")
+        preview_text = f"; the scene so far: {stop.preview}" if stop.preview else ""
+        note(f"stopped in {stop.stage}; the same command resumes{preview_text}")
         click.get_current_context().exit(1)
     note_rename(output, result.output)
     if as_json:
@@ -118,8 +118,8 @@ def _print_result(result: MakeResult) -> None:
         click.echo(f"poses: {poses['registered']} of {poses['photos']} photos{sure}")
         for name, reason in list(poses["left_out"].items())[:MAX_LISTED_PHOTOS]:
             click.echo(f"  left out: {name}, {reason}")
-        if (more := len(poses["left_out"]) - MAX_LISTED_PHOTOS) > 0:
-            click.echo(f"  left out: {more} more, see {result.work / 'scene' / 'poses.json'}")
+        if (unlisted_count := len(poses["left_out"]) - MAX_LISTED_PHOTOS) > 0:
+            click.echo(f"  left out: {unlisted_count} more, see {result.work / 'scene' / 'poses.json'}")
     times = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())
     total = f"{result.total_seconds:.0f} s in all"
     click.echo(f"times: {times}, {total}; intermediate results are in {result.work}, which you may delete")

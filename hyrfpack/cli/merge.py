@@ -63,9 +63,11 @@ def merge(
             moves.setdefault(name, []).append(_ACTION_BY_OPTION[option](numbers))
         except ValueError as error:
             raise click.UsageError(f"--{option}: {error}") from error
+    for path in models:
+        resolve_model_file(path)  # raises an error for splats, which names the command that imports them
     from hyrfpack.edit import merge_models
 
-    report = merge_models([_resolve(path) for path in models], output, moves, overwrite=overwrite)
+    report = merge_models(models, output, moves, overwrite=overwrite)
     note_rename(output, report.file)
     if as_json:
         print_json(report.to_dict())
@@ -73,9 +75,3 @@ def merge(
     rows = [[part.name, f"{part.gaussians:,}", f"{part.bytes:,}"] for part in report.parts]
     click.echo(format_table(["part", "Gaussians", "bytes"], rows))
     click.echo(f"{report.file}: {report.bytes:,} bytes")
-
-
-def _resolve(path: Path) -> Path:
-    """Return the path of a model or run, after a check that it is no splats."""
-    resolve_model_file(path)
-    return path

@@ -14,8 +14,8 @@ class OrderedCommand(click.Command):
     """A command that keeps the order in which its options were given, for `options_in_order`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        _, _, given = self.make_parser(ctx).parse_args(args=list(args))
-        ctx.meta[_ORDER_KEY] = [str(parameter.name) for parameter in given]
+        _, _, parameters = self.make_parser(ctx).parse_args(args=list(args))
+        ctx.meta[_ORDER_KEY] = [str(parameter.name) for parameter in parameters]
         return super().parse_args(ctx, args)
 
 
@@ -24,7 +24,7 @@ def options_in_order(ctx: click.Context, values: dict[str, Any]) -> Iterator[tup
 
     The value of an option that is only counted is None.
     """
-    left = {name: iter(given if isinstance(given, tuple) else [None] * given) for name, given in values.items()}
+    remaining_values = {name: iter(uses if isinstance(uses, tuple) else [None] * uses) for name, uses in values.items()}
     for name in ctx.meta[_ORDER_KEY]:
-        if name in left:
-            yield name, next(left[name])
+        if name in remaining_values:
+            yield name, next(remaining_values[name])

@@ -68,7 +68,7 @@ def _print_result(result: PosesReport) -> None:
     )
     for reason, count in Counter(result.left_out.values()).most_common():
         names = [name for name, why in result.left_out.items() if why == reason]
-        more = f" and {count - _MAX_NAMED_PHOTOS} more" if count > _MAX_NAMED_PHOTOS else ""
-        click.echo(f"left out, {reason}: {', '.join(names[:_MAX_NAMED_PHOTOS])}{more}")
+        others = f" and {count - _MAX_NAMED_PHOTOS} more" if count > _MAX_NAMED_PHOTOS else ""
+        click.echo(f"left out, {reason}: {', '.join(names[:_MAX_NAMED_PHOTOS])}{others}")
     run = f"runs/{result.scene.resolve().name}"
     click.echo(f"next: hyrfpack train {shlex.quote(str(result.scene))} -o {shlex.quote(run)}")

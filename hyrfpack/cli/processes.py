@@ -73,10 +73,10 @@ def remove_processes_option(arguments: Sequence[str]) -> list[str]:
         >>> remove_processes_option(["train", "photos", "--processes", "2", "--steps", "9"])
         ['train', 'photos', '--steps', '9']
     """
-    left, words = [], iter(arguments)
+    kept_words, words = [], iter(arguments)
     for word in words:
         if word == PROCESSES_OPTION:
             next(words, None)
         elif not word.startswith(f"{PROCESSES_OPTION}="):
-            left.append(word)
-    return left
+            kept_words.append(word)
+    return kept_words

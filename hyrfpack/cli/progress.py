@@ -20,6 +20,6 @@ def show_item_progress(items: Iterable[T], count: int, command: str, noun: str) 
     from hyrfpack.progress import TaskEvent, open_display
 
     with open_display("auto", command) as progress:
-        for done, item in enumerate(items, start=1):
-            progress(TaskEvent(f"{noun} {done}/{count}", done / count))
+        for number, item in enumerate(items, start=1):
+            progress(TaskEvent(f"{noun} {number}/{count}", number / count))
             yield item

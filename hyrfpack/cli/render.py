@@ -109,12 +109,7 @@ def render(
       hyrfpack render other.ply -o orbit --orbit 90
       hyrfpack render city-scene -o walk --cameras walk.json --gaussians 500000
     """
-    if sum(source is not None for source in (data, cameras, orbit)) > 1:
-        raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
-    if depth_unit != DEFAULT_DEPTH_UNIT and depth != "png":
-        raise click.UsageError("--depth-unit is the step of a 16-bit PNG; give it with --depth png")
-    if gaussians is not None and level_bytes is not None:
-        raise click.UsageError("--gaussians and --bytes each limit what a view draws; give one of them")
+    _check_usage(data, cameras, orbit, depth, depth_unit, gaussians, level_bytes)
     from hyrfpack.atomic import write_atomic
     from hyrfpack.cameras.files import cameras_to_json
     from hyrfpack.lock import exclusive_folder
@@ -130,13 +125,13 @@ def render(
     levels = source.load_levels(gaussians, level_bytes) if has_budget else None
     if data is not None:
         scene = ranks.run_on_all(lambda: read_scene(data, reader_options, source.facts))
-        named = [(view.name, view.camera) for view in select_views(scene, split)]
+        named_cameras = [(view.name, view.camera) for view in select_views(scene, split)]
     else:
-        named = _name_cameras(source, cameras, orbit or DEFAULT_ORBIT_FRAMES)
+        named_cameras = _name_cameras(source, cameras, orbit or DEFAULT_ORBIT_FRAMES)
     video_path = output / "video.mp4" if video and has_ffmpeg() else None
     if video and not video_path:
         note("ffmpeg was not found, so only pictures are written; install the ffmpeg program for a video")
-    names = render_file_names([name for name, _ in named], geometry)
+    names = render_file_names([name for name, _ in named_cameras], geometry)
     names += [video_path.name] if video_path else []
     names += [CAMERAS_NAME] if writer else []
 
@@ -146,9 +141,9 @@ def render(
             outputs.folder(output, names)
 
     def write() -> tuple[list[Path], float]:
-        picture_of = _picture_renderer(source, levels, settings, geometry)
-        pictures = write_pictures(picture_of, named, output, geometry=writer, overwrite=overwrite, ranks=ranks)
-        count, written = len(ranks.share(named)), []
+        draw_view = _make_picture_renderer(source, levels, settings, geometry)
+        pictures = write_pictures(draw_view, named_cameras, output, geometry=writer, overwrite=overwrite, ranks=ranks)
+        count, written = len(ranks.share(named_cameras)), []
         try:
             for path in show_item_progress(pictures, count, "render", "picture"):
                 written.append(path)
@@ -161,31 +156,49 @@ def render(
     ranks.run_on_all(lambda: check(replace=True))
     with exclusive_folder(output, ranks=ranks):  # the lock is held until the video is written, too
         ranks.run_on_all(lambda: check(replace=overwrite))
-        width, height = largest_picture_size(camera for _, camera in named)
-        note(f"rendering {format_count(len(named), 'picture')} of up to {width} x {height} pixels")
+        width, height = largest_picture_size(camera for _, camera in named_cameras)
+        note(f"rendering {format_count(len(named_cameras), 'picture')} of up to {width} x {height} pixels")
         parts = ranks.all_gather(ranks.run_on_all(write))
         if not ranks.is_main:
             return
-        written = [parts[index % ranks.size][0][index // ranks.size] for index in range(len(named))]
+        written = [parts[index % ranks.size][0][index // ranks.size] for index in range(len(named_cameras))]
         if writer:
-            text = cameras_to_json(
-                list(zip(unique_stems([name for name, _ in named]), [camera for _, camera in named], strict=True))
-            )
+            stems = unique_stems([name for name, _ in named_cameras])
+            text = cameras_to_json([(stem, camera) for stem, (_, camera) in zip(stems, named_cameras, strict=True)])
             write_atomic(output / CAMERAS_NAME, text.encode(), overwrite=overwrite, rename=False)
             writer.warn_of_losses(max(max_depth for _, max_depth in parts))
         if video_path:
             video_path = note_rename(video_path, write_video(written, video_path, overwrite=overwrite))
     if levels is not None and levels.choices:
         _note_levels(levels)
-    for name, path in zip(render_file_names([name for name, _ in named]), written, strict=True):
+    for name, path in zip(render_file_names([name for name, _ in named_cameras]), written, strict=True):
         note_rename(output / name, path)
     if as_json:
         print_json({"pictures": [str(path) for path in written], "video": str(video_path) if video_path else None})
-    else:
-        film = f" and {video_path.name}" if video_path else ""
-        kinds = " and ".join(kind for kind, extension in (("depth", depth), ("normals", normals)) if extension)
-        pictures = f"{format_count(len(written), 'picture')}{film}, {width} x {height} pixels"
-        click.echo(f"{output}: {pictures}{kinds and f', with {kinds}'}")
+        return
+    video_text = f" and {video_path.name}" if video_path else ""
+    geometry_kinds = [kind for kind, extension in (("depth", depth), ("normals", normals)) if extension]
+    geometry_text = f", with {' and '.join(geometry_kinds)}" if geometry_kinds else ""
+    pictures = f"{format_count(len(written), 'picture')}{video_text}, {width} x {height} pixels"
+    click.echo(f"{output}: {pictures}{geometry_text}")
+
+
+def _check_usage(
+    data: Path | None,
+    cameras: Path | None,
+    orbit: int | None,
+    depth: str | None,
+    depth_unit: float,
+    gaussians: int | None,
+    level_bytes: int | None,
+) -> None:
+    """Raise UsageError for options that contradict each other."""
+    if sum(source is not None for source in (data, cameras, orbit)) > 1:
+        raise click.UsageError("--data, --cameras and --orbit each say what to render; give one of them")
+    if depth_unit != DEFAULT_DEPTH_UNIT and depth != "png":
+        raise click.UsageError("--depth-unit is the step of a 16-bit PNG; give it with --depth png")
+    if gaussians is not None and level_bytes is not None:
+        raise click.UsageError("--gaussians and --bytes each limit what a view draws; give one of them")
 
 
 def _name_cameras(source: RenderSource, cameras: Path | None, frames: int) -> list[tuple[str, Camera]]:
@@ -198,7 +211,7 @@ def _name_cameras(source: RenderSource, cameras: Path | None, frames: int) -> li
     return [(f"{number:04d}", camera) for number, camera in enumerate(orbit(source.viewpoint, frames))]
 
 
-def _picture_renderer(
+def _make_picture_renderer(
     source: RenderSource, levels: LevelRenderer | None, settings: RenderSettings, geometry: GeometryConfig
 ) -> Callable[[Camera], RenderedPicture]:
     """Return a function that renders a camera: from levels of detail if they are given, else from the whole source."""
@@ -207,10 +220,10 @@ def _picture_renderer(
 
     if levels is not None:
         return partial(levels.draw, settings=settings, geometry=geometry)
-    shown = source.load()
-    if isinstance(shown, Drawable):
-        return partial(draw_picture, shown, settings=settings, geometry=geometry)
-    return make_renderer(shown, geometry=geometry, settings=settings)
+    drawn_model = source.load()
+    if isinstance(drawn_model, Drawable):
+        return partial(draw_picture, drawn_model, settings=settings, geometry=geometry)
+    return make_renderer(drawn_model, geometry=geometry, settings=settings)
 
 
 def _note_levels(levels: LevelRenderer) -> None:

@@ -20,13 +20,13 @@ def format_section_table(
         shares: shares of the loss by section, as in `hyrfpack.CompressionReport`.
     """
     parts = sum_layers(sections)
-    rest = SectionSize("", "header, table of contents, padding", 0, total - sum(part.after for part in parts))
+    overhead = SectionSize("", "header, table of contents, padding", 0, total - sum(part.after for part in parts))
     header = ["section", "unpacked bytes", "stored bytes", "share", "bits/Gaussian", "bits/number"]
     rows = []
     stored = {part.type for part in parts}
     if stored.isdisjoint(shares or ()):  # each part of a merged file has sections of its own, which are not listed
         shares = None
-    for part in (*parts, rest):
+    for part in (*parts, overhead):
         row = [
             f"{part.type} {part.holds}".strip(),
             f"{part.before:,}" if part.type else "",

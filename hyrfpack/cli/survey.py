@@ -47,5 +47,5 @@ def print_survey(survey: PhotoSurvey) -> None:
 def _format_counts(counts: dict[str, int]) -> str:
     """Return counts by name as text, such as "98 of 400 x 266, 2 of 266 x 400"."""
     parts = [f"{count:,} of {name}" for name, count in list(counts.items())[:_MAX_LISTED_KINDS]]
-    more = len(counts) - _MAX_LISTED_KINDS
-    return ", ".join(parts) + (f" and {more} more kinds" if more > 0 else "")
+    unlisted_count = len(counts) - _MAX_LISTED_KINDS
+    return ", ".join(parts) + (f" and {unlisted_count} more kinds" if unlisted_count > 0 else "")

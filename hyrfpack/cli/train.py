@@ -30,6 +30,7 @@ from hyrfpack.errors import HyrfNoPosesError, suggest_command
 
 if TYPE_CHECKING:
     from hyrfpack.parallel.ranks import Ranks
+    from hyrfpack.train import TrainResult
 
 
 @click.command(short_help="Train a model on photos with poses.")
@@ -118,27 +119,17 @@ def train(
         raise click.UsageError(
             "--poses runs in one process only; run 'hyrfpack poses' first, then train from its folder"
         )
-    from hyrfpack.blocks.journal import is_begun as is_block_run_begun
     from hyrfpack.blocks.plan import parse_grid
     from hyrfpack.blocks.run import train_blocks
     from hyrfpack.context import RunContext
     from hyrfpack.data import PictureCache
     from hyrfpack.device import describe_device
-    from hyrfpack.format.run_folder import MODEL_FILE
     from hyrfpack.train import train_model
-    from hyrfpack.train.run import is_begun, resuming
+    from hyrfpack.train.run import resuming
 
     if blocks not in (None, "auto"):
         parse_grid(blocks)  # before photos are read, which takes minutes for large scenes
     torch_device = choose_command_device(device, ranks)
-
-    def is_resumable(run: Path) -> bool:
-        if blocks is None:
-            return is_begun(run)
-        # A single block, which "auto" may choose, is trained as a run without blocks.
-        is_single = blocks == "auto" or parse_grid(blocks) == (1, 1)
-        return is_block_run_begun(run) or (is_single and is_begun(run))
-
     try:
         scene = ranks.run_on_all(lambda: read_scene(data, reader_options))
     except HyrfNoPosesError:
@@ -147,27 +138,55 @@ def train(
         scene = read_scene(
             _estimate_poses(data, out, reader_options["images"], resume, overwrite), {**reader_options, "images": None}
         )
-    where = describe_device(torch_device) + ("" if ranks.is_single else f" in each of {ranks.size} processes")
+    device_text = describe_device(torch_device) + ("" if ranks.is_single else f" in each of {ranks.size} processes")
     photos = format_count(len(scene.train), "photo")
-    note(f"{scene.layout} scene: {photos} to train on, {len(scene.test)} held out; on {where}")
+    note(f"{scene.layout} scene: {photos} to train on, {len(scene.test)} held out; on {device_text}")
     cache = None if cache_mb is None else PictureCache(cache_mb * 2**20 // ranks.local_size)
     config, context = TrainConfig(**settings), RunContext(device=torch_device, ranks=ranks, cache=cache)
-    shows = view and ranks.is_main
-    with serve_training_view(out.name, shows, view_port if shows else None) as observer:
+    serves_view = view and ranks.is_main
+    with serve_training_view(out.name, serves_view, view_port if serves_view else None) as observer:
         try:
-            run = train_model if blocks is None else partial(train_blocks, blocks=blocks)
-            result = run(
+            train_scene = train_model if blocks is None else partial(train_blocks, blocks=blocks)
+            result = train_scene(
                 scene, out, config, resume=resume, overwrite=overwrite, observer=observer, log=log, context=context
             )
         except KeyboardInterrupt:
-            if not is_resumable(out):
+            if not _is_resumable(out, blocks):
                 raise
             note(f"stopped; {resuming(overwrite)} continues")
             click.get_current_context().exit(1)
-    note_if_verbose(
-        "seconds: " + ", ".join(f"{part} {t:.1f}" for part, t in result.metrics.get("stage_seconds", {}).items())
-    )
-    if not result.complete and not is_resumable(out):
+    _note_outcome(result, out, blocks, overwrite)
+    if as_json:
+        print_json({"complete": result.complete, "step": result.step, **result.metrics})
+    elif result.complete and ranks.is_main:
+        _print_result(result)
+        if view:
+            note(f"to see the model again, run {suggest_command('view', result.model)}")
+    if not result.complete:
+        click.get_current_context().exit(1)
+
+
+def _is_resumable(run: Path, blocks: str | None) -> bool:
+    """Return whether a folder holds a run that has begun, of the kind that --blocks names."""
+    from hyrfpack.blocks.journal import is_begun as is_block_run_begun
+    from hyrfpack.blocks.plan import parse_grid
+    from hyrfpack.train.run import is_begun
+
+    if blocks is None:
+        return is_begun(run)
+    # A single block, which "auto" may choose, is trained as a run without blocks.
+    is_single = blocks == "auto" or parse_grid(blocks) == (1, 1)
+    return is_block_run_begun(run) or (is_single and is_begun(run))
+
+
+def _note_outcome(result: TrainResult, out: Path, blocks: str | None, overwrite: bool) -> None:
+    """Print notes on the times of the stages, on how to resume, and on files that are missing or have other names."""
+    from hyrfpack.format.run_folder import MODEL_FILE
+    from hyrfpack.train.run import resuming
+
+    seconds_by_stage = result.metrics.get("stage_seconds", {})
+    note_if_verbose("seconds: " + ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in seconds_by_stage.items()))
+    if not result.complete and not _is_resumable(out, blocks):
         note("stopped before the first step; run the same command to start again")
     elif not result.complete:
         note(f"stopped after step {result.step:,}; {resuming(overwrite)} continues from there")
@@ -175,21 +194,18 @@ def train(
         note_rename(out / MODEL_FILE, result.model)
     if result.missing:
         note(f"{resuming(overwrite)} writes the missing files")
-    if as_json:
-        print_json({"complete": result.complete, "step": result.step, **result.metrics})
-    elif result.complete and ranks.is_main:
-        metrics = result.metrics
-        click.echo(
-            f"{result.model}: {format_count(metrics['gaussians'], 'Gaussian')}, {metrics['bytes']:,} bytes, "
-            f"{metrics['seconds']:.0f} s of training"
-        )
-        if scores := metrics.get("evaluation"):
-            consistent = format_consistent_psnr(scores.get("psnr_consistent"))
-            click.echo(f"held-out views: {scores['psnr']:.2f} dB{consistent}, SSIM {scores['ssim']:.4f}")
-        if view:
-            note(f"to see the model again, run {suggest_command('view', result.model)}")
-    if not result.complete:
-        click.get_current_context().exit(1)
+
+
+def _print_result(result: TrainResult) -> None:
+    """Print the size of the model of a complete run, and its scores on held-out views."""
+    metrics = result.metrics
+    click.echo(
+        f"{result.model}: {format_count(metrics['gaussians'], 'Gaussian')}, {metrics['bytes']:,} bytes, "
+        f"{metrics['seconds']:.0f} s of training"
+    )
+    if scores := metrics.get("evaluation"):
+        consistent = format_consistent_psnr(scores.get("psnr_consistent"))
+        click.echo(f"held-out views: {scores['psnr']:.2f} dB{consistent}, SSIM {scores['ssim']:.4f}")
 
 
 def _estimate_poses(photos: Path, run: Path, images: str | None, resume: bool, overwrite: bool) -> Path:

@@ -38,5 +38,5 @@ class GeometryConfig:
     @property
     def endings(self) -> tuple[str, ...]:
         """The endings of the files of a view, such as ".depth.png"."""
-        kinds = {"depth": self.depth, "normals": self.normals}
-        return tuple(f".{kind}.{extension}" for kind, extension in kinds.items() if extension)
+        extensions = {"depth": self.depth, "normals": self.normals}
+        return tuple(f".{kind}.{extension}" for kind, extension in extensions.items() if extension)

@@ -106,8 +106,8 @@ class DensityConfig:
         """Return the corners (time, number of Gaussians) of a run in which each round reaches its target number."""
         if self.stop < self.start:
             return [(0, initial), (1, initial)]
-        most, peak = self.excess * budget, min(max(self.start, self.peak), self.stop)
-        return [(0, initial), (self.start, initial), (peak, most), (self.stop, budget), (1, budget)]
+        peak_count, peak = self.excess * budget, min(max(self.start, self.peak), self.stop)
+        return [(0, initial), (self.start, initial), (peak, peak_count), (self.stop, budget), (1, budget)]
 
     def mean_count(self, initial: int, budget: int) -> float:
         """Return the mean number of Gaussians over a run in which each round reaches its target number."""
@@ -185,8 +185,8 @@ class TrainConfig:
             "a target size": self.target_bytes,
             "a factor": self.budget_factor,
         }
-        if len(given := [name for name, value in sizes.items() if value is not None]) > 1:
-            raise ValueError(f"{' and '.join(given)} each decide how large the model is; give one")
+        if len(given_sizes := [name for name, value in sizes.items() if value is not None]) > 1:
+            raise ValueError(f"{' and '.join(given_sizes)} each decide how large the model is; give one")
         check_pair("grid_resolutions", self.grid_resolutions)
         coarsest, finest = self.grid_resolutions
         check_int("the finest of grid_resolutions", finest, 2, 65536)

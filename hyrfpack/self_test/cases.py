@@ -75,62 +75,62 @@ _MIXED_BOUNDS = (5e-3, 2e-2)
 
 
 @cache
-def self_test_cases() -> dict[str, SelfTestCase]:
+def list_self_test_cases() -> dict[str, SelfTestCase]:
     """Return all cases by name. The kernels that others depend on come first."""
     return {
-        "hash_encode": _hash_encode(),
-        "mlp": _mlp(GEOMETRY_WIDTHS, mixed=False),
-        "mlp, geometry, mixed precision": _mlp(GEOMETRY_WIDTHS, mixed=True),
-        "mlp, radiance, mixed precision": _mlp(RADIANCE_WIDTHS, mixed=True),
-        "contract": _contract(),
-        "encode_views, frequency": _encode_views("frequency"),
-        "encode_views, sh": _encode_views("sh"),
-        "activate_geometry, sum": _activate("sum"),
-        "activate_geometry, product": _activate("product"),
-        "frustum_cull": _frustum_cull(),
-        "rasterize": _rasterize(RasterSettings(depth=True)),
-        "rasterize, antialiased": _rasterize(RasterSettings(antialiased=True), reserve=8192),
-        "rasterize, training": _rasterize_in_training(),
-        "rasterize, replay": _replay(),
-        "shade": _shade(mixed=False),
-        "shade, mixed precision": _shade(mixed=True),
-        "rasterize_shaded": _rasterize_shaded(mixed=False),
-        "rasterize_shaded, mixed precision": _rasterize_shaded(mixed=True),
-        "background_grid": _background(),
-        "background_grid, mixed precision": _background(TRAINED_GRID_RESOLUTIONS, mixed=True),
-        "background_grid, gradients": _background(needs_grad=True),
-        "composite": _composite(),
-        "photometric_loss": _loss(masked=False),
-        "photometric_loss, masked": _loss(masked=True),
-        "adam_step": _adam(),
+        "hash_encode": _make_hash_encode_case(),
+        "mlp": _make_mlp_case(GEOMETRY_WIDTHS, mixed=False),
+        "mlp, geometry, mixed precision": _make_mlp_case(GEOMETRY_WIDTHS, mixed=True),
+        "mlp, radiance, mixed precision": _make_mlp_case(RADIANCE_WIDTHS, mixed=True),
+        "contract": _make_contract_case(),
+        "encode_views, frequency": _make_encode_views_case("frequency"),
+        "encode_views, sh": _make_encode_views_case("sh"),
+        "activate_geometry, sum": _make_activate_case("sum"),
+        "activate_geometry, product": _make_activate_case("product"),
+        "frustum_cull": _make_frustum_cull_case(),
+        "rasterize": _make_rasterize_case(RasterSettings(depth=True)),
+        "rasterize, antialiased": _make_rasterize_case(RasterSettings(antialiased=True), reserve=8192),
+        "rasterize, training": _make_rasterize_in_training_case(),
+        "rasterize, replay": _make_replay_case(),
+        "shade": _make_shade_case(mixed=False),
+        "shade, mixed precision": _make_shade_case(mixed=True),
+        "rasterize_shaded": _make_rasterize_shaded_case(mixed=False),
+        "rasterize_shaded, mixed precision": _make_rasterize_shaded_case(mixed=True),
+        "background_grid": _make_background_case(),
+        "background_grid, mixed precision": _make_background_case(TRAINED_GRID_RESOLUTIONS, mixed=True),
+        "background_grid, gradients": _make_background_case(needs_grad=True),
+        "composite": _make_composite_case(),
+        "photometric_loss": _make_loss_case(masked=False),
+        "photometric_loss, masked": _make_loss_case(masked=True),
+        "adam_step": _make_adam_case(),
     }
 
 
-def _normal(seed: int, *shape: int) -> Tensor:
+def _draw_normal(seed: int, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def _uniform(seed: int, *shape: int) -> Tensor:
+def _draw_uniform(seed: int, *shape: int) -> Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def _viewport() -> Viewport:
+def _make_viewport() -> Viewport:
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, 3] = torch.tensor([0.1, -0.05, 4.0])
     return Viewport(pose, (30.0, 32.0, 0.45 * IMAGE_WIDTH, 0.55 * IMAGE_HEIGHT), IMAGE_WIDTH, IMAGE_HEIGHT)
 
 
-def _layers(widths: tuple[int, ...], seed: int) -> dict[str, Tensor]:
+def _make_layers(widths: tuple[int, ...], seed: int) -> dict[str, Tensor]:
     """Return weights "w0", "w1", ... and biases "b0", "b1", ... of an MLP."""
     layers: dict[str, Tensor] = {}
     for layer, (inputs, outputs) in enumerate(zip(widths, widths[1:], strict=False)):
-        layers[f"w{layer}"] = _normal(seed + layer, outputs, inputs) / inputs**0.5
-        layers[f"b{layer}"] = 0.1 * _normal(seed + 10 + layer, outputs)
+        layers[f"w{layer}"] = _draw_normal(seed + layer, outputs, inputs) / inputs**0.5
+        layers[f"b{layer}"] = 0.1 * _draw_normal(seed + 10 + layer, outputs)
     return layers
 
 
 def _split_layers(inputs: Inputs) -> tuple[list[Tensor], list[Tensor]]:
-    """Return the weights and the biases of `_layers`."""
+    """Return the weights and the biases of `_make_layers`."""
     return [inputs[f"w{layer}"] for layer in range(3)], [inputs[f"b{layer}"] for layer in range(3)]
 
 
@@ -150,10 +150,10 @@ def _take_listed(implementation: str, x: Inputs, *names: str) -> tuple[list[Tens
     return [rows.view(len(index), *x[name].shape[1:]) for name, rows in zip(names, listed, strict=True)], used
 
 
-def _hash_encode() -> SelfTestCase:
+def _make_hash_encode_case() -> SelfTestCase:
     # Coordinates have 16 bits, so that a point has the same cell and offset in every precision.
     coords = torch.randint(0, 1 << 16, (700, 3), generator=torch.Generator().manual_seed(0)) / (1 << 16)
-    table = _normal(1, level_offsets(GRID_RESOLUTIONS, LOG2_TABLE_SIZE)[-1], 2)
+    table = _draw_normal(1, level_offsets(GRID_RESOLUTIONS, LOG2_TABLE_SIZE)[-1], 2)
     inputs = {"coords": coords, "table": table, **_list_rows(700)}
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
@@ -169,9 +169,9 @@ def _hash_encode() -> SelfTestCase:
     return SelfTestCase("hash_encode", inputs, run, ("coords", "table"), True)
 
 
-def _mlp(widths: tuple[int, ...], mixed: bool) -> SelfTestCase:
-    layers = _layers(widths, 1)
-    inputs = {"rows": _normal(0, 300, widths[0]), **layers, **_list_rows(300)}
+def _make_mlp_case(widths: tuple[int, ...], mixed: bool) -> SelfTestCase:
+    layers = _make_layers(widths, 1)
+    inputs = {"rows": _draw_normal(0, 300, widths[0]), **layers, **_list_rows(300)}
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         def evaluate(rows: Tensor, used: Tensor | None = None) -> Tensor:
@@ -187,8 +187,8 @@ def _mlp(widths: tuple[int, ...], mixed: bool) -> SelfTestCase:
     return SelfTestCase("mlp", inputs, run, ("rows", *layers), not mixed, bounds, mixed)
 
 
-def _contract() -> SelfTestCase:
-    points = _normal(0, 1500, 3) * torch.logspace(-1, 2, 1500)[:, None]
+def _make_contract_case() -> SelfTestCase:
+    points = _draw_normal(0, 1500, 3) * torch.logspace(-1, 2, 1500)[:, None]
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         (listed,), used = _take_listed(implementation, x, "points")
@@ -199,8 +199,8 @@ def _contract() -> SelfTestCase:
     return SelfTestCase("contract", {"points": points, **_list_rows(1500)}, run)
 
 
-def _encode_views(encoding: str) -> SelfTestCase:
-    inputs = {"points": _normal(0, 700, 3), "viewpoint": _normal(1, 3), **_list_rows(700)}
+def _make_encode_views_case(encoding: str) -> SelfTestCase:
+    inputs = {"points": _draw_normal(0, 700, 3), "viewpoint": _draw_normal(1, 3), **_list_rows(700)}
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         def encode(points: Tensor, used: Tensor | None = None) -> Tensor:
@@ -213,9 +213,9 @@ def _encode_views(encoding: str) -> SelfTestCase:
     return SelfTestCase("encode_views", inputs, run)
 
 
-def _activate(rule: str) -> SelfTestCase:
-    rows = {"raw": _normal(0, 700, 8), "positions": 2 * _normal(1, 700, 3)}
-    rows |= {"scale_logits": _normal(2, 700, 1), "opacity_logits": _normal(3, 700, 1)}
+def _make_activate_case(rule: str) -> SelfTestCase:
+    rows = {"raw": _draw_normal(0, 700, 8), "positions": 2 * _draw_normal(1, 700, 3)}
+    rows |= {"scale_logits": _draw_normal(2, 700, 1), "opacity_logits": _draw_normal(3, 700, 1)}
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         def activate(prefix: str, rows: list[Tensor], used: Tensor | None = None) -> dict[str, Tensor]:
@@ -232,35 +232,35 @@ def _activate(rule: str) -> SelfTestCase:
     return SelfTestCase("activate_geometry", rows | _list_rows(700), run, ("raw", "scale_logits", "opacity_logits"))
 
 
-def _frustum_cull() -> SelfTestCase:
+def _make_frustum_cull_case() -> SelfTestCase:
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
-        positions, frustum = x["positions"], (_viewport(), 0.01, 0.1)
+        positions, frustum = x["positions"], (_make_viewport(), 0.01, 0.1)
         index = frustum_cull(positions, *frustum, implementation=implementation)
         if implementation != "gpu":
             return {"index": index, "rows": positions[index]}
         listed, used, _ = frustum_cull_into(positions, *frustum, len(positions), implementation="gpu")
         return {"index": index, "rows": take_rows(positions, listed, used)[: len(index)]}
 
-    return SelfTestCase("frustum_cull", {"positions": 3 * _normal(0, 3000, 3)}, run, has_cpu_kernels=True)
+    return SelfTestCase("frustum_cull", {"positions": 3 * _draw_normal(0, 3000, 3)}, run, has_cpu_kernels=True)
 
 
-def _splats(count: int) -> dict[str, Tensor]:
+def _make_splats(count: int) -> dict[str, Tensor]:
     return {
-        "means": _normal(0, count, 3),
-        "quats": _normal(1, count, 4),
-        "scales": 0.1 * torch.exp(0.5 * _normal(2, count, 3)),
-        "opacities": torch.sigmoid(1.5 * _normal(3, count)),
+        "means": _draw_normal(0, count, 3),
+        "quats": _draw_normal(1, count, 4),
+        "scales": 0.1 * torch.exp(0.5 * _draw_normal(2, count, 3)),
+        "opacities": torch.sigmoid(1.5 * _draw_normal(3, count)),
     }
 
 
-def _rasterize(settings: RasterSettings, reserve: int | None = None) -> SelfTestCase:
+def _make_rasterize_case(settings: RasterSettings, reserve: int | None = None) -> SelfTestCase:
     """Return the case of these settings; kernels render into the reserve, if any."""
-    inputs = _splats(300) | {"colors": _uniform(4, 300, 3)}
+    inputs = _make_splats(300) | {"colors": _draw_uniform(4, 300, 3)}
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         *gaussians, colors = x.values()
         image = rasterize(
-            Gaussians3D(*gaussians), colors, _viewport(), settings,
+            Gaussians3D(*gaussians), colors, _make_viewport(), settings,
             reserve=reserve if implementation == "gpu" else None, implementation=implementation,
         )  # fmt: skip
         depth = {"depth": image.depth} if image.depth is not None else {}
@@ -269,15 +269,15 @@ def _rasterize(settings: RasterSettings, reserve: int | None = None) -> SelfTest
     return SelfTestCase("rasterize", inputs, run, tuple(inputs), True, _RASTER_BOUNDS)
 
 
-def _rasterize_in_training() -> SelfTestCase:
+def _make_rasterize_in_training_case() -> SelfTestCase:
     """Return the case of a training step: listed Gaussians, reserved pairs, and sums of absolute gradients."""
-    rows = _splats(300) | {"colors": _uniform(4, 300, 3)}
+    rows = _make_splats(300) | {"colors": _draw_uniform(4, 300, 3)}
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         (*gaussians, colors), used = _take_listed(implementation, x, *rows)
         absgrad = torch.zeros_like(colors[:, :2])  # The backward pass adds to it, before this result is compared.
         image = rasterize(
-            Gaussians3D(*gaussians), colors, _viewport(), absgrad=absgrad, used=used,
+            Gaussians3D(*gaussians), colors, _make_viewport(), absgrad=absgrad, used=used,
             reserve=8192 if implementation == "gpu" else None, implementation=implementation,
         )  # fmt: skip
         return {"rgb": image.rgb, "transmittance": image.transmittance, "absgrad": absgrad[: int(x["used"])]}
@@ -285,9 +285,9 @@ def _rasterize_in_training() -> SelfTestCase:
     return SelfTestCase("rasterize", rows | _list_rows(300), run, tuple(rows), True, _RASTER_BOUNDS)
 
 
-def _replay() -> SelfTestCase:
-    """The backward pass replays the transmittance of the forward pass; all bits have to agree."""
-    inputs = _splats(300) | {"colors": _uniform(4, 300, 3)}
+def _make_replay_case() -> SelfTestCase:
+    """Return the case in which the backward pass replays the transmittance of the forward pass; all bits must agree."""
+    inputs = _make_splats(300) | {"colors": _draw_uniform(4, 300, 3)}
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         if implementation != "gpu":
@@ -295,19 +295,19 @@ def _replay() -> SelfTestCase:
         from hyrfpack.ops.rasterize.gpu import replay_transmittance
 
         *gaussians, colors = x.values()
-        stored, replayed = replay_transmittance(Gaussians3D(*gaussians), colors, _viewport(), RasterSettings())
+        stored, replayed = replay_transmittance(Gaussians3D(*gaussians), colors, _make_viewport(), RasterSettings())
         return {"equal pixels": (stored == replayed).float()}
 
     return SelfTestCase("rasterize", inputs, run, bounds=(1e-6, 1e-6), reference_runs=False)
 
 
-def _shading_inputs(count: int, mixed: bool) -> dict[str, Tensor]:
-    layers = _layers((HIDDEN_WIDTH, HIDDEN_WIDTH, 3), 20)
-    first = _normal(10, count, HIDDEN_WIDTH)
+def _make_shading_inputs(count: int, mixed: bool) -> dict[str, Tensor]:
+    layers = _make_layers((HIDDEN_WIDTH, HIDDEN_WIDTH, 3), 20)
+    first = _draw_normal(10, count, HIDDEN_WIDTH)
     return {
         "first_layer": first.to(torch.bfloat16) if mixed else first,
-        "direction_weight": _normal(11, HIDDEN_WIDTH, DIRECTION_FEATURES["frequency"]) / 5,
-        "color_logits": _normal(12, count, 3),
+        "direction_weight": _draw_normal(11, HIDDEN_WIDTH, DIRECTION_FEATURES["frequency"]) / 5,
+        "color_logits": _draw_normal(12, count, 3),
     } | layers
 
 
@@ -316,8 +316,10 @@ def _make_shading(x: Inputs, mixed: bool) -> Shading:
     return Shading(x["first_layer"], x["direction_weight"], weights, biases, x["color_logits"], "frequency", mixed)
 
 
-def _shade(mixed: bool) -> SelfTestCase:
-    inputs = {"positions": _normal(0, 300, 3), "viewpoint": 3 * _normal(1, 3)} | _shading_inputs(300, mixed)
+def _make_shade_case(mixed: bool) -> SelfTestCase:
+    inputs = {"positions": _draw_normal(0, 300, 3), "viewpoint": 3 * _draw_normal(1, 3)} | _make_shading_inputs(
+        300, mixed
+    )
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         shading = _make_shading(x, mixed)
@@ -326,30 +328,30 @@ def _shade(mixed: bool) -> SelfTestCase:
     return SelfTestCase("shade", inputs, run, (), not mixed, _MIXED_BOUNDS if mixed else (1e-4, 1e-3), mixed)
 
 
-def _rasterize_shaded(mixed: bool) -> SelfTestCase:
-    splats = _splats(300)
+def _make_rasterize_shaded_case(mixed: bool) -> SelfTestCase:
+    splats = _make_splats(300)
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         gaussians = Gaussians3D(*(x[name] for name in splats))
         settings = RasterSettings(depth=True)
-        image = rasterize(gaussians, _make_shading(x, mixed), _viewport(), settings, implementation=implementation)
+        image = rasterize(gaussians, _make_shading(x, mixed), _make_viewport(), settings, implementation=implementation)
         assert image.depth is not None
         return {"rgb": image.rgb, "transmittance": image.transmittance, "depth": image.depth}
 
     bounds = _MIXED_BOUNDS if mixed else _RASTER_BOUNDS
-    return SelfTestCase("rasterize_shaded", splats | _shading_inputs(300, mixed), run, (), False, bounds, mixed)
+    return SelfTestCase("rasterize_shaded", splats | _make_shading_inputs(300, mixed), run, (), False, bounds, mixed)
 
 
-def _background(
+def _make_background_case(
     resolutions: tuple[int, ...] = GRID_RESOLUTIONS, *, mixed: bool = False, needs_grad: bool = False
 ) -> SelfTestCase:
     features = 2 * len(resolutions) + DIRECTION_FEATURES["frequency"]
-    table = _normal(30, level_offsets(resolutions, LOG2_TABLE_SIZE)[-1], 2)
+    table = _draw_normal(30, level_offsets(resolutions, LOG2_TABLE_SIZE)[-1], 2)
     # Light passes in stripes, at a distance from the threshold.
     light = torch.where(
         torch.arange(IMAGE_HEIGHT * IMAGE_WIDTH).view(IMAGE_HEIGHT, IMAGE_WIDTH) // 100 % 2 == 0, 0.9, 0.1
     )
-    parameters = {"table": table} | _layers((features, HIDDEN_WIDTH, HIDDEN_WIDTH, 3), 31)
+    parameters = {"table": table} | _make_layers((features, HIDDEN_WIDTH, HIDDEN_WIDTH, 3), 31)
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         field = BackgroundField(
@@ -357,7 +359,7 @@ def _background(
         )
         grid = background_grid(
             x["transmittance"],
-            _viewport(),
+            _make_viewport(),
             field,
             threshold=0.5,
             stride=BACKGROUND_STRIDE,
@@ -372,9 +374,12 @@ def _background(
     return SelfTestCase("background_grid", inputs, run, gradients, not mixed, bounds, mixed)
 
 
-def _composite() -> SelfTestCase:
-    inputs = {"rgb": _uniform(0, IMAGE_HEIGHT, IMAGE_WIDTH, 3), "transmittance": _uniform(1, IMAGE_HEIGHT, IMAGE_WIDTH)}
-    inputs["grid"] = _uniform(2, *grid_size(IMAGE_HEIGHT, IMAGE_WIDTH, BACKGROUND_STRIDE), 3)
+def _make_composite_case() -> SelfTestCase:
+    inputs = {
+        "rgb": _draw_uniform(0, IMAGE_HEIGHT, IMAGE_WIDTH, 3),
+        "transmittance": _draw_uniform(1, IMAGE_HEIGHT, IMAGE_WIDTH),
+    }
+    inputs["grid"] = _draw_uniform(2, *grid_size(IMAGE_HEIGHT, IMAGE_WIDTH, BACKGROUND_STRIDE), 3)
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         return {
@@ -386,11 +391,11 @@ def _composite() -> SelfTestCase:
     return SelfTestCase("composite", inputs, run, tuple(inputs), True)
 
 
-def _loss(masked: bool) -> SelfTestCase:
-    target = _uniform(0, IMAGE_HEIGHT, IMAGE_WIDTH, 3)
-    inputs = {"image": (target + 0.1 * _normal(1, IMAGE_HEIGHT, IMAGE_WIDTH, 3)).clamp(0, 1), "target": target}
+def _make_loss_case(masked: bool) -> SelfTestCase:
+    target = _draw_uniform(0, IMAGE_HEIGHT, IMAGE_WIDTH, 3)
+    inputs = {"image": (target + 0.1 * _draw_normal(1, IMAGE_HEIGHT, IMAGE_WIDTH, 3)).clamp(0, 1), "target": target}
     if masked:
-        inputs["mask"] = _uniform(2, IMAGE_HEIGHT, IMAGE_WIDTH) < 0.7
+        inputs["mask"] = _draw_uniform(2, IMAGE_HEIGHT, IMAGE_WIDTH) < 0.7
 
     def run(implementation: str, x: Inputs) -> dict[str, Tensor]:
         return {"loss": photometric_loss(x["image"], x["target"], x.get("mask"), implementation=implementation)}
@@ -398,14 +403,14 @@ def _loss(masked: bool) -> SelfTestCase:
     return SelfTestCase("photometric_loss", inputs, run, ("image",), True)
 
 
-def _adam() -> SelfTestCase:
+def _make_adam_case() -> SelfTestCase:
     # Tensors of odd sizes end within a block. One gradient is not finite, and its element must not change.
     shapes = {"a": (1500, 3), "b": (701,)}
     inputs: dict[str, Tensor] = {}
     for seed, (name, shape) in enumerate(shapes.items()):
-        inputs[f"value {name}"], inputs[f"gradient {name}"] = _normal(seed, *shape), _normal(seed + 2, *shape)
-        inputs[f"exp_avg {name}"] = 0.1 * _normal(seed + 4, *shape)
-        inputs[f"exp_avg_sq {name}"] = _uniform(seed + 6, *shape)
+        inputs[f"value {name}"], inputs[f"gradient {name}"] = _draw_normal(seed, *shape), _draw_normal(seed + 2, *shape)
+        inputs[f"exp_avg {name}"] = 0.1 * _draw_normal(seed + 4, *shape)
+        inputs[f"exp_avg_sq {name}"] = _draw_uniform(seed + 6, *shape)
     inputs["gradient b"][3] = torch.inf
     inputs["enabled"] = torch.tensor([True, False])  # whether the second and third step change anything
     gradient_names = [f"gradient {name}" for name in shapes]

@@ -32,14 +32,16 @@ def check_case(case: SelfTestCase, implementation: str, device: torch.device) ->
     measured = run_case(case, implementation, torch.float32, device)
     seconds = perf_counter() - start
     row: Row = {"seconds": round(seconds, 3)}
-    for what, found, expected, bound in zip(("value", "gradient"), measured, exact, case.bounds, strict=True):
+    for kind, measured_tensors, expected, bound in zip(
+        ("value", "gradient"), measured, exact, case.bounds, strict=True
+    ):
         for name, tensor in expected.items():
-            error = _relative_error(found[name], tensor)
+            error = _relative_error(measured_tensors[name], tensor)
             # NaN counts as infinite, because the maximum of NaN and a later number may be that number.
-            shown = inf if isnan(error) else error
-            row[f"{what} error"] = max(shown, float(str(row.get(f"{what} error", 0.0))))
+            comparable_error = inf if isnan(error) else error
+            row[f"{kind} error"] = max(comparable_error, float(str(row.get(f"{kind} error", 0.0))))
             if not error <= bound and "status" not in row:
-                of = f"the gradient of {name}" if what == "gradient" else name
+                of = f"the gradient of {name}" if kind == "gradient" else name
                 row |= {"status": "failed", "note": f"{of} {_describe_error(error, bound)}"}
     if "status" in row and case.reference_runs:
         plain, kernels = (_median_seconds(case, name, device) for name in ("reference", implementation))
@@ -74,15 +76,15 @@ def _random_like(value: Tensor, seed: int) -> Tensor:
     return numbers.to(value.device, value.dtype)
 
 
-def _relative_error(found: Tensor, exact: Tensor) -> float:
+def _relative_error(measured: Tensor, exact: Tensor) -> float:
     """Return the rms of the difference over the rms of the exact values.
 
     It is infinity if the shapes differ, and NaN if a value is not finite.
     """
-    if found.shape != exact.shape:
+    if measured.shape != exact.shape:
         return float("inf")
     try:
-        return measure_relative_error(found.double(), exact.double(), "").rms
+        return measure_relative_error(measured.double(), exact.double(), "").rms
     except HyrfError:
         return float("nan")
 

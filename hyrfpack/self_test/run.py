@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from hyrfpack.parallel.child_items import Row, run_in_children
-from hyrfpack.self_test.cases import self_test_cases
+from hyrfpack.self_test.cases import list_self_test_cases
 
 # A case compiles up to ten kernels. Compilation of one takes seconds on a slow CPU, and a kernel that hangs never ends.
 MAX_CASE_SECONDS = 120.0
@@ -84,10 +84,10 @@ def run_self_test(
         max_case_seconds: time limit for each case with its compilation; a case that exceeds it has failed.
         max_seconds: time limit for all cases together.
     """
-    cases = self_test_cases()
+    cases = list_self_test_cases()
     names = [name for name, case in cases.items() if implementation == "gpu" or case.has_cpu_kernels]
     make_command = command or _worker_command
-    found: dict[str, Row] = {}
+    rows_by_name: dict[str, Row] = {}
     for row in run_in_children(
         lambda left: make_command(implementation, str(device), left),
         [DEVICE_ITEM, *([LAUNCH_ITEM] if implementation == "gpu" else []), *names],
@@ -96,14 +96,14 @@ def run_self_test(
     ):
         name = str(row["item"])
         if name in cases:
-            found[name] = {"operation": cases[name].replaced_operation, **row}
+            rows_by_name[name] = {"operation": cases[name].replaced_operation, **row}
         elif "status" in row and name == DEVICE_ITEM:
             return SelfTest(implementation, str(device), (), str(row["note"]))
         elif "status" in row:
             fix = f"; {row['fix']}" if "fix" in row else ""
             problem = f"Triton cannot compile and launch kernels here ({row['note']}){fix}"
             return SelfTest(implementation, str(device), (), problem, can_launch=False)
-    return SelfTest(implementation, str(device), tuple(found[name] for name in names))
+    return SelfTest(implementation, str(device), tuple(rows_by_name[name] for name in names))
 
 
 def _worker_command(implementation: str, device: str, names: Sequence[str]) -> list[str]:

@@ -17,7 +17,7 @@ import torch
 from hyrfpack.errors import short_reason
 from hyrfpack.out_of_memory import describe_out_of_memory
 from hyrfpack.parallel.child_items import Row, describe_exception, run_items
-from hyrfpack.self_test.cases import self_test_cases
+from hyrfpack.self_test.cases import list_self_test_cases
 from hyrfpack.self_test.check import check_case
 from hyrfpack.self_test.run import DEVICE_ITEM, LAUNCH_ITEM
 
@@ -34,7 +34,7 @@ def run_cases(implementation: str, device: torch.device, names: Sequence[str]) -
         elif name == LAUNCH_ITEM:
             yield from _check_launch(device)
         else:
-            yield check_case(self_test_cases()[name], implementation, device)
+            yield check_case(list_self_test_cases()[name], implementation, device)
 
     if device.type == "cuda" and device.index is not None:
         with suppress(RuntimeError):  # The first item meets the same error and reports it.

@@ -16,7 +16,7 @@ from scenes import ball_scene
 from torch.utils._pytree import tree_map
 
 from hyrfpack.render import render_view
-from hyrfpack.self_test.cases import self_test_cases
+from hyrfpack.self_test.cases import list_self_test_cases
 from hyrfpack.self_test.check import run_case
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 
@@ -72,7 +72,7 @@ def describe_variant(kernel: Any, given: dict[str, Any]) -> str:
 @pytest.fixture(scope="module")
 def tested_variants() -> set[str]:
     with use_fake_gpu() as gpu, record_variants(not_run=SLOW_KERNELS) as variants:
-        for case in self_test_cases().values():
+        for case in list_self_test_cases().values():
             run_case(case, "gpu", torch.float32, gpu)
     return variants
 

@@ -20,7 +20,7 @@ from hyrfpack.parallel import has_numba
 from hyrfpack.parallel.child_items import ROW_PREFIX
 from hyrfpack.self_test import SelfTest, run_self_test, worker
 from hyrfpack.self_test import run as self_test_run
-from hyrfpack.self_test.cases import Inputs, SelfTestCase, self_test_cases
+from hyrfpack.self_test.cases import Inputs, SelfTestCase, list_self_test_cases
 from hyrfpack.self_test.check import check_case
 from hyrfpack.self_test.worker import CACHE_FIX, INSTALL_FIX, explain_launch_failure
 
@@ -29,7 +29,7 @@ CPU_DEVICE = torch.device("cpu")
 # Cases that the interpreter runs within a second.
 QUICK_CASES = ("contract", "encode_views, sh", "activate_geometry, sum", "shade", "composite", "adam_step")
 
-ALL_CASES = self_test_cases()
+ALL_CASES = list_self_test_cases()
 
 needs_interpreter = pytest.mark.skipif(not IS_INTERPRETED, reason="kernels are compiled for the GPU that is there")
 
@@ -40,7 +40,7 @@ def run_broken(broken: dict[str, str], cases: Sequence[str] = QUICK_CASES, **lim
     def command(implementation: str, device: str, names: Sequence[str]) -> list[str]:
         return [sys.executable, str(BROKEN_WORKER_FILE), json.dumps(broken), implementation, device, *names]
 
-    with mock.patch.object(self_test_run, "self_test_cases", lambda: {name: ALL_CASES[name] for name in cases}):
+    with mock.patch.object(self_test_run, "list_self_test_cases", lambda: {name: ALL_CASES[name] for name in cases}):
         return run_self_test("gpu", CPU_DEVICE, command, **limits)
 
 

@@ -9,7 +9,7 @@ from ops.device import IS_INTERPRETED, needs_triton
 triton = pytest.importorskip("triton")
 import triton.language as tl  # noqa: E402
 
-from hyrfpack.self_test.cases import self_test_cases  # noqa: E402
+from hyrfpack.self_test.cases import list_self_test_cases  # noqa: E402
 from tools.gpu import races  # noqa: E402
 
 pytestmark = [needs_triton, pytest.mark.skipif(not IS_INTERPRETED, reason="races are found in Triton's interpreter")]
@@ -146,7 +146,7 @@ def report() -> races.RaceReport:
     """The launches of all cases of the self-test, with their gradients."""
     report = races.RaceReport()
     with races.watch_launches(report):
-        for case in self_test_cases().values():
+        for case in list_self_test_cases().values():
             tensors = {name: tensor.clone() for name, tensor in case.inputs.items()}
             leaves = [tensors[name].requires_grad_() for name in case.gradient_inputs]
             with torch.set_grad_enabled(bool(leaves)):

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 
-from hyrfpack.self_test.cases import self_test_cases
+from hyrfpack.self_test.cases import list_self_test_cases
 from hyrfpack.self_test.check import check_case
 from tools.gpu.process import TimedProcess
 from tools.gpu.rows import Row
@@ -21,7 +21,7 @@ DOCTOR_PROBLEM_PREFIX, DOCTOR_RESULT_PREFIX = "problem: ", "self-test: "
 
 def items(setup: Setup) -> list[str]:
     """Return the names of the self-test's cases, and one item for the command."""
-    cases = self_test_cases()
+    cases = list_self_test_cases()
     return [
         *(name for name, case in cases.items() if setup.implementation == "gpu" or case.has_cpu_kernels),
         DOCTOR_ITEM,
@@ -38,7 +38,7 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
     if item == DOCTOR_ITEM:
         yield row | _run_doctor(setup)
     else:
-        yield row | check_case(self_test_cases()[item], setup.implementation, setup.torch_device)
+        yield row | check_case(list_self_test_cases()[item], setup.implementation, setup.torch_device)
 
 
 def _run_doctor(setup: Setup) -> Row:

@@ -10,7 +10,7 @@ from itertools import islice
 from pathlib import Path
 
 from hyrfpack.parallel.child_items import DONE_PREFIX, child_environment
-from hyrfpack.self_test.cases import self_test_cases
+from hyrfpack.self_test.cases import list_self_test_cases
 from tools.gpu.process import TimedProcess
 from tools.gpu.rows import Row
 from tools.gpu.setup import Setup
@@ -39,7 +39,7 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
             "note": "compute-sanitizer is not installed here",
         }
         return
-    cases = self_test_cases()
+    cases = list_self_test_cases()
     names = [name for name, case in cases.items() if item == "memcheck" or case.operation in product_operations()]
     worker = [sys.executable, "-m", "hyrfpack.self_test.worker", setup.implementation, f"{setup.device}:0", *names]
     # torch's cache of memory would hide accesses between two tensors.
@@ -56,7 +56,7 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
 
 def product_operations() -> set[str]:
     """Return the operations whose kernels multiply matrices, through shared memory: those with mixed precision."""
-    return {case.operation for case in self_test_cases().values() if case.is_mixed}
+    return {case.operation for case in list_self_test_cases().values() if case.is_mixed}
 
 
 def count_checked_cases(output: str) -> int:
