@@ -22,7 +22,7 @@ from hyrfpack.render.depth_normals import normals_from_depth
 from hyrfpack.render.files import make_renderer
 from hyrfpack.render.surface import render_surface
 from hyrfpack.scene import Camera
-from tools.studies.mesh_error import compute_demo_depth, nearest_surface
+from tools.studies.mesh_error import compute_demo_depth, find_nearest_surface
 
 RAW_FILE = Path(__file__).parents[1] / "golden" / "trained" / "demo.hyrf"
 CAMERA = Camera(40, 30, 35.0, 38.0, 18.0, 16.0, np.eye(4))
@@ -162,7 +162,7 @@ def test_depth_and_normals_of_a_trained_scene_are_near_the_true_ones():
         assert picture.depth is not None and picture.normals is not None
         near = (exact < 6) & (picture.depth.numpy() > 0)
         points = (rays_of(camera) * exact[..., None])[near]
-        _, normals = nearest_surface((points - camera.camera_from_world[:3, 3]) @ camera.rotation)
+        _, normals = find_nearest_surface((points - camera.camera_from_world[:3, 3]) @ camera.rotation)
         depth_errors.append(np.abs(picture.depth.numpy() - exact)[near] / exact[near])
         normal_errors.append(angles(picture.normals.numpy()[near], normals))
     assert np.median(np.concatenate(depth_errors)) < 0.04

@@ -173,7 +173,7 @@ def test_harmonics_are_orthonormal_on_the_sphere():
     radius = np.sqrt(1 - z**2)[:, None]
     sphere = np.stack((radius * np.cos(phi), radius * np.sin(phi), np.broadcast_to(z[:, None], (8, 16))), -1)
 
-    basis = ablation_models.harmonics_to_degree_3(torch.from_numpy(sphere.reshape(-1, 3))).numpy()
+    basis = ablation_models.evaluate_harmonics_to_degree_3(torch.from_numpy(sphere.reshape(-1, 3))).numpy()
 
     gram = (basis * np.repeat(weights * 2 * np.pi / 16, 16)[:, None]).T @ basis
     np.testing.assert_allclose(gram, np.eye(16), atol=1e-12)
@@ -198,7 +198,7 @@ def test_harmonic_colours_match_the_formula_of_3dgs():
     model.gaussians.color_logits.data = (coefficients * rates).flatten(1)
     viewpoint, index = torch.tensor([3.0, 1.0, 0.5]), torch.tensor([4, 9])
 
-    basis = ablation_models.harmonics_to_degree_3(
+    basis = ablation_models.evaluate_harmonics_to_degree_3(
         torch.nn.functional.normalize(model.gaussians.positions.detach().double() - viewpoint, dim=-1)
     )
     expected = ((basis[..., None] * coefficients).sum(1) + 0.5).clamp_min(0)

@@ -82,7 +82,7 @@ def test_an_unknown_format_is_refused_before_anything_is_read(
 
 def test_distances_to_the_disk_end_at_its_edge():
     points = np.array([[4.9, 0.0, 0.1], [8.0, 0.0, 4.0], [0.0, 0.0, 2.5]])
-    np.testing.assert_allclose(mesh_scale.surface_distances(points), [0.1, 5.0, 0.5])
+    np.testing.assert_allclose(mesh_scale.measure_surface_distances(points), [0.1, 5.0, 0.5])
 
 
 @pytest.mark.parametrize(

@@ -20,9 +20,9 @@ from tools.studies.step_profile import (
     OPERATION_ROWS,
     StepProfile,
     StepRecorder,
-    backward_row,
     count_evaluations,
-    new_nodes,
+    find_backward_row,
+    iterate_new_nodes,
     profile_steps,
     split_step,
     table_rows,
@@ -117,9 +117,12 @@ def test_a_node_of_the_graph_belongs_to_the_first_result_that_it_leads_to() -> N
     first = x.exp()
     second = (first * x).sum()
     seen: set = set()
-    assert {node.name() for node in new_nodes([first], seen)} == {"ExpBackward0", "torch::autograd::AccumulateGrad"}
-    assert [node.name() for node in new_nodes([second], seen)] == ["SumBackward0", "MulBackward0"]
-    assert list(new_nodes([first, second], seen)) == []
+    assert {node.name() for node in iterate_new_nodes([first], seen)} == {
+        "ExpBackward0",
+        "torch::autograd::AccumulateGrad",
+    }
+    assert [node.name() for node in iterate_new_nodes([second], seen)] == ["SumBackward0", "MulBackward0"]
+    assert list(iterate_new_nodes([first, second], seen)) == []
 
 
 @pytest.mark.parametrize(
@@ -134,7 +137,7 @@ def test_a_node_of_the_graph_belongs_to_the_first_result_that_it_leads_to() -> N
     ],
 )
 def test_a_node_is_assigned_to_its_row(operation: str, node: str, row: str | None) -> None:
-    assert backward_row(operation, node) == row
+    assert find_backward_row(operation, node) == row
 
 
 def test_counts_of_a_small_step_match_a_count_by_hand() -> None:

@@ -127,5 +127,7 @@ def _measure_peak_bytes(task: Callable[[], object]) -> float:
 def _measure_logit_error(decoded: HybridModel, model: HybridModel, plan: Plan | None) -> float:
     """Return the root mean square error of the worst group of explicit logits."""
     order = slice(None) if plan is None else plan.kept
-    after, before = to_arrays(decoded), to_arrays(model)
-    return max(float(np.sqrt(np.square(after[group] - before[group][order]).mean())) for group in LOGIT_SECTIONS)
+    decoded_arrays, model_arrays = to_arrays(decoded), to_arrays(model)
+    return max(
+        float(np.sqrt(np.square(decoded_arrays[group] - model_arrays[group][order]).mean())) for group in LOGIT_SECTIONS
+    )

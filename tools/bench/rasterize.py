@@ -52,10 +52,10 @@ def time_stages(inputs: dict[str, Tensor], viewport: Viewport, implementation: s
     upstream = make_random_cotangent(torch.empty(*size, 3)), make_random_cotangent(torch.empty(size))
     started, work = perf_counter(), process_time()
     picture = rasterize(Gaussians3D(*gaussians), colors, viewport, absgrad=absgrad, implementation=implementation)
-    between, work_between = perf_counter(), process_time()
+    forward_end, forward_end_work = perf_counter(), process_time()
     torch.autograd.backward([picture.rgb, picture.transmittance], upstream)
-    times = {**picture.seconds, "forward": between - started, "backward": perf_counter() - between}
-    times |= {"forward_work": work_between - work, "backward_work": process_time() - work_between}
+    times = {**picture.seconds, "forward": forward_end - started, "backward": perf_counter() - forward_end}
+    times |= {"forward_work": forward_end_work - work, "backward_work": process_time() - forward_end_work}
     return {"pairs": picture.pairs, **{stage: 1e3 * seconds for stage, seconds in times.items()}}
 
 

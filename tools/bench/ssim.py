@@ -29,7 +29,8 @@ def compare(image: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, flo
     """
     call = make_loss_call(image, target, mask)
     times, results = time_alternately(
-        {way: call.forward_backward_task(way) for way in ("cpu", "reference")}, TIMING_REPEATS
+        {implementation: call.forward_backward_task(implementation) for implementation in ("cpu", "reference")},
+        TIMING_REPEATS,
     )
     (value, (gradient,)), (exact, (slope,)) = results["cpu"], call.forward_backward_task("reference", torch.float64)()
     return {

@@ -349,9 +349,11 @@ def build(task: tuple[str, str]) -> list[Build]:
                 numbers = 256 * target.warp_size
                 _spilling_kernel[(1,)](torch.empty(2 * numbers), COUNT=numbers, num_warps=1)
             else:
-                whole = name == next(iter(GPU_TARGETS))
-                for sizes in LAUNCH_SIZES if whole else LAUNCH_SIZES[:1]:
-                    for run in islice(OPERATION_RUNS[operation](*sizes), None if whole else RUNS_ON_OTHER_TARGETS):
+                is_main_target = name == next(iter(GPU_TARGETS))
+                for sizes in LAUNCH_SIZES if is_main_target else LAUNCH_SIZES[:1]:
+                    for run in islice(
+                        OPERATION_RUNS[operation](*sizes), None if is_main_target else RUNS_ON_OTHER_TARGETS
+                    ):
                         run()
         except Exception as error:  # if the host code fails, the other operations still run
             last = traceback.extract_tb(error.__traceback__)[-1]
@@ -421,9 +423,9 @@ def list_kernels(_: object = None) -> list[str]:
         if module.name.rpartition(".")[2].startswith("gpu"):
             importlib.import_module(module.name)
     modules = [module for name, module in sys.modules.items() if name.startswith("hyrfpack.ops.")]
-    found = {value for module in modules for value in vars(module).values() if isinstance(value, JITFunction)}
-    called = {other for function in found for other in _iterate_called_functions(function)}
-    return sorted(_kernel_name(function) for function in found - called if not _returns_value(function))
+    functions = {value for module in modules for value in vars(module).values() if isinstance(value, JITFunction)}
+    called = {callee for function in functions for callee in _iterate_called_functions(function)}
+    return sorted(_kernel_name(function) for function in functions - called if not _returns_value(function))
 
 
 def _kernel_name(function: JITFunction) -> str:
@@ -475,8 +477,8 @@ def build_all_with(folder: str) -> dict[str, Any]:
     """Return what `build_all` returns with the Triton that is installed in a folder."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join((folder, os.environ.get("PYTHONPATH", "")))}
     command = [sys.executable, "-m", "tools.gpu.build", "--json"]
-    done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-    return json.loads(done.stdout.splitlines()[-1])
+    process = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(process.stdout.splitlines()[-1])
 
 
 def main() -> None:

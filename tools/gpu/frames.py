@@ -72,18 +72,18 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
 
 def _statistics_row(room: str, splats: Splats, model: HybridModel) -> Row:
     with torch.no_grad():
-        drawn = rasterize(splats.gaussians, splats.colors, splats.viewport)
-    pixels = drawn.transmittance.numel()
+        rasterization = rasterize(splats.gaussians, splats.colors, splats.viewport)
+    pixels = rasterization.transmittance.numel()
     blended, reached = count_blended(splats)
     return {
         "table": "The room",
         "Gaussians": room,
-        "visible": f"{int(drawn.visible.sum()):,}",
-        "pairs": f"{int(drawn.pairs):,}",
-        "pairs a pixel": 256 * int(drawn.pairs) / pixels,
+        "visible": f"{int(rasterization.visible.sum()):,}",
+        "pairs": f"{int(rasterization.pairs):,}",
+        "pairs a pixel": 256 * int(rasterization.pairs) / pixels,
         "blended a pixel": blended,
         "of a tile's pairs reached": f"{reached:.0%}",
-        "light from the background": f"{float(drawn.transmittance.mean()):.1%}",
+        "light from the background": f"{float(rasterization.transmittance.mean()):.1%}",
         "median opacity": float(splats.inputs["opacities"].median()),
         "hash rows a level": f"2^{model.config.radiance.log2_table_size}",
     }

@@ -80,15 +80,15 @@ def measure_rasterize(name: str, look: Look, setup: Setup) -> Iterator[Row]:
     pairs, pixels, count = int(raster.pairs), setup.width * setup.height, len(splats.inputs["means"])
     blended, reached = count_blended(splats)
     tiles = -(-setup.width // 16) * -(-setup.height // 16)
-    seen = int(raster.visible.sum())
-    size = f"{count:,} Gaussians, {seen:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
+    visible_count = int(raster.visible.sum())
+    size = f"{count:,} Gaussians, {visible_count:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
     works = {
         "project": roofline.count_project(count),
-        "bin": roofline.count_bin_pairs(seen, pairs, tiles),
+        "bin": roofline.count_bin_pairs(visible_count, pairs, tiles),
         "blend": roofline.count_blend(pairs, pixels, reached, blended),
     }
     backward_works = {
-        "project": roofline.count_project_backward(seen),
+        "project": roofline.count_project_backward(visible_count),
         "blend": roofline.count_blend_backward(pairs, pixels, reached, blended),
     }
     totals = (sum(works.values(), Work(0, 0)), sum(backward_works.values(), Work(0, 0)))
@@ -244,16 +244,16 @@ def measure_rasterize_shaded(setup: Setup) -> Iterator[Row]:
             return rasterize(splats.gaussians, shading, viewport, implementation=setup.implementation)
 
         raster = draw()
-        pairs, seen = int(raster.pairs), int(raster.visible.sum())
+        pairs, visible_count = int(raster.pairs), int(raster.visible.sum())
         ms = median_ms({"draw": draw}, setup.repeats, setup.torch_device)["draw"]
-        project = roofline.count_project_shaded(len(model), seen, _widths(shading), shading.mixed)
+        project = roofline.count_project_shaded(len(model), visible_count, _widths(shading), shading.mixed)
         # The decoder's arithmetic and the blending's run on different units, so only the decoder's own row counts it.
-        total_work = Work(project.bytes, 0) + roofline.count_bin_pairs(seen, pairs, tiles)
+        total_work = Work(project.bytes, 0) + roofline.count_bin_pairs(visible_count, pairs, tiles)
         total_work += roofline.count_blend(pairs, pixels, reached, blended)
         viewport = crop_splats(splats, setup.crop).viewport
         expected = rasterize(exact, _cast(shading, torch.float64), viewport, implementation="reference")
         error = relative_error(join_color_and_transmittance(draw(viewport)), join_color_and_transmittance(expected))
-        size = f"{len(model):,} Gaussians, {seen:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
+        size = f"{len(model):,} Gaussians, {visible_count:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
         row = _row(f"rasterize shaded, {precision}", "forward", size, ms, total_work, setup)
         yield row | {"value error": error} | status_beyond(error, 3e-3 if shading.mixed else 1e-3)
         stages = group_kernels(profile_task(draw, 5, setup.torch_device).times, STAGE_KERNEL_WORDS, "bin")

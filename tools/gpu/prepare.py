@@ -58,14 +58,14 @@ def copy_dataset(source: Path, target: Path) -> None:
 
 def is_same_scene(first: Scene, second: Scene) -> bool:
     """Return whether two scenes have the same photos for training and tests, cameras and points, but for rounding."""
-    views, others = first.train + first.test, second.train + second.test
-    if [v.name for v in views] != [v.name for v in others] or len(first.train) != len(second.train):
+    views, second_views = first.train + first.test, second.train + second.test
+    if [v.name for v in views] != [v.name for v in second_views] or len(first.train) != len(second.train):
         return False
     return np.allclose(first.points, second.points, rtol=1e-6) and all(
-        np.allclose(view.camera.camera_from_world, other.camera.camera_from_world)
-        and np.allclose(view.camera.intrinsics, other.camera.intrinsics)
-        and np.array_equal(view.load().rgb, other.load().rgb)
-        for view, other in zip(views, others, strict=True)
+        np.allclose(view.camera.camera_from_world, second_view.camera.camera_from_world)
+        and np.allclose(view.camera.intrinsics, second_view.camera.intrinsics)
+        and np.array_equal(view.load().rgb, second_view.load().rgb)
+        for view, second_view in zip(views, second_views, strict=True)
     )
 
 
@@ -102,12 +102,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if BUILD_FOLDER.resolve() not in folder.parents:
         parser.error(f"--folder {args.folder} would be replaced; name a folder below build/, such as build/gpu")
     BUILD_FOLDER.mkdir(exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=BUILD_FOLDER) as made:
+    with tempfile.TemporaryDirectory(dir=BUILD_FOLDER) as temporary:
         # The report names the set by its folder.
-        copy_dataset(args.data, Path(made, "copy", args.data.name))
+        copy_dataset(args.data, Path(temporary, "copy", args.data.name))
         shutil.rmtree(folder, ignore_errors=True)
         folder.parent.mkdir(parents=True, exist_ok=True)
-        Path(made, "copy").rename(folder)
+        Path(temporary, "copy").rename(folder)
     megabytes = (folder_bytes(folder) + tree_bytes()) / 2**20
     print(f"{args.folder}: {folder_bytes(folder) / 2**20:.1f} MiB; with the repository {megabytes:.1f} MiB")
     if megabytes > MAX_MEGABYTES:

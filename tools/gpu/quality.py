@@ -65,8 +65,8 @@ def _affordable_steps(scene: Scene, setup: Setup) -> int:
     """Return the number of steps: `quality_steps`, or as many as the CPU can take in `quality_seconds`."""
     _train(scene, 2, "float32", torch.device("cpu"))  # the first run compiles the kernels
     _, row = _train(scene, PROBE_STEPS, "float32", torch.device("cpu"))
-    each = LATE_STEP_TIME_RATIO * row["seconds"] / PROBE_STEPS
-    return min(setup.quality_steps, max(MIN_STEPS, int(setup.quality_seconds / each)))
+    step_seconds = LATE_STEP_TIME_RATIO * row["seconds"] / PROBE_STEPS
+    return min(setup.quality_steps, max(MIN_STEPS, int(setup.quality_seconds / step_seconds)))
 
 
 def _train(scene: Scene, steps: int, precision: str, device: torch.device) -> tuple[float, Row]:

@@ -136,8 +136,8 @@ def _has_conflicting_stores(stores: np.ndarray, *, same_place: bool) -> bool:
     if same_place:
         order = np.lexsort((stores[_PLACE], stores[_PROGRAM], stores[_ADDRESS]))
         a, b = stores[:, order[:-1]], stores[:, order[1:]]
-        same = (a[_ADDRESS] == b[_ADDRESS]) & (a[_PROGRAM] == b[_PROGRAM]) & (a[_PLACE] == b[_PLACE])
-        return bool((same & (a[_VALUE] != b[_VALUE])).any())
+        is_same_store = (a[_ADDRESS] == b[_ADDRESS]) & (a[_PROGRAM] == b[_PROGRAM]) & (a[_PLACE] == b[_PLACE])
+        return bool((is_same_store & (a[_VALUE] != b[_VALUE])).any())
     addresses, group = np.unique(stores[_ADDRESS], return_inverse=True)
     return bool(
         (_varies(stores[_PROGRAM], group, len(addresses)) & _varies(stores[_VALUE], group, len(addresses))).any()
@@ -301,8 +301,8 @@ def _tensors_in(values: Sequence[Any]) -> Iterator[torch.Tensor]:
 def _all_tensors() -> list[torch.Tensor]:
     import gc
 
-    found = [value for value in gc.get_objects() if type(value) in (torch.Tensor, torch.nn.Parameter)]
-    return [tensor for tensor in found if tensor.device.type == "cpu" and tensor.numel()]
+    tensors = [value for value in gc.get_objects() if type(value) in (torch.Tensor, torch.nn.Parameter)]
+    return [tensor for tensor in tensors if tensor.device.type == "cpu" and tensor.numel()]
 
 
 def _bounds(tensors: Sequence[torch.Tensor]) -> np.ndarray:
@@ -327,8 +327,8 @@ def _are_inside(addresses: np.ndarray, width: int, bounds: np.ndarray) -> np.nda
     """Return for each element whether it lies inside one of the ranges of `_bounds`."""
     if not bounds.shape[1]:
         return np.zeros(addresses.shape, dtype=bool)
-    place = np.searchsorted(bounds[0], addresses, side="right").astype(np.int64) - 1
-    return (place >= 0) & (addresses + np.uint64(width) <= bounds[1][np.maximum(place, 0)])
+    interval = np.searchsorted(bounds[0], addresses, side="right").astype(np.int64) - 1
+    return (interval >= 0) & (addresses + np.uint64(width) <= bounds[1][np.maximum(interval, 0)])
 
 
 # -- the plugin of pytest ----------------------------------------------------------------------------------------------

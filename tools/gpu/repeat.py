@@ -43,11 +43,11 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
 
 def compare(name: str, first: Tensor, second: Tensor) -> Row:
     """Return the row of one result; it has failed if bits differ where the order of all sums is fixed."""
-    same = torch.equal(first, second)
+    has_same_bits = torch.equal(first, second)
     difference = float((first - second).abs().max()) if first.numel() else 0.0
-    row: Row = {"table": TABLE_NAME, "result": name, "same bits": "yes" if same else "no"}
+    row: Row = {"table": TABLE_NAME, "result": name, "same bits": "yes" if has_same_bits else "no"}
     row |= {"largest difference": difference}
-    if not same and UNORDERED_WORD not in name:
+    if not has_same_bits and UNORDERED_WORD not in name:
         row |= {"status": "failed", "note": "two equal calls differ, though no kernel of theirs adds in any order"}
     return row
 

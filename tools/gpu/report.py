@@ -123,8 +123,8 @@ def format_table(rows: Sequence[Row]) -> str:
 
 def _first_output_line(*command: str) -> str | None:
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+        process = subprocess.run(command, capture_output=True, text=True, timeout=20)
     except (OSError, subprocess.TimeoutExpired):
         return None
-    lines = done.stdout.split("\n")
+    lines = process.stdout.split("\n")
     return lines[0].strip() or None

@@ -48,8 +48,11 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
     output = "".join(process.lines())
     row: Row = {"table": TABLE_NAME, "tool": item, "cases": f"{count_checked_cases(output)} of {len(names)}"}
     if process.is_out_of_time:
-        found = "; ".join(islice(_iterate_report_lines(output), 4))[:300]
-        yield row | {"status": "failed", "note": f"not done within {TOOL_SECONDS[item]:.0f} s; it printed: {found}"}
+        printed_lines = "; ".join(islice(_iterate_report_lines(output), 4))[:300]
+        yield row | {
+            "status": "failed",
+            "note": f"not done within {TOOL_SECONDS[item]:.0f} s; it printed: {printed_lines}",
+        }
     else:
         yield row | describe_output(output, process.exit_code, len(names))
 

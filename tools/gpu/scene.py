@@ -152,10 +152,10 @@ def count_blended(splats: Splats) -> tuple[float, float]:
         processed before all its pixels are finished.
     """
     viewport = splats.viewport
-    seen = project(splats.gaussians, viewport, RasterSettings())
-    seen = seen.select(torch.argsort(seen.depths))
-    reach = (2 * torch.log(255 * seen.opacities).clamp_min(0))[:, None] * seen.covs2d[:, [0, 2]]
-    lower, upper = seen.means2d - reach.sqrt(), seen.means2d + reach.sqrt()
+    projected = project(splats.gaussians, viewport, RasterSettings())
+    projected = projected.select(torch.argsort(projected.depths))
+    reach = (2 * torch.log(255 * projected.opacities).clamp_min(0))[:, None] * projected.covs2d[:, [0, 2]]
+    lower, upper = projected.means2d - reach.sqrt(), projected.means2d + reach.sqrt()
     columns, rows = -(-viewport.width // TILE_SIZE), -(-viewport.height // TILE_SIZE)
     tiles = torch.linspace(0, columns * rows - 1, min(MAX_SAMPLED_TILES, columns * rows)).long().tolist()
     corners = torch.stack(torch.meshgrid(torch.arange(TILE_SIZE), torch.arange(TILE_SIZE), indexing="xy"), -1).view(
@@ -165,11 +165,11 @@ def count_blended(splats: Splats) -> tuple[float, float]:
     for tile in tiles:
         corner = torch.tensor([TILE_SIZE * (tile % columns), TILE_SIZE * (tile // columns)])
         pixels = (corner + corners + 0.5).to(lower)
-        inside = (lower <= pixels[-1]).all(-1) & (upper >= pixels[0]).all(-1) & (seen.opacities >= ALPHA_MIN)
-        here = seen.select(torch.nonzero(inside)[:, 0])
-        dx, dy = (here.means2d - pixels[:, None]).unbind(-1)
-        a, b, c = here.conics.unbind(-1)
-        alphas = here.opacities * torch.exp((-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy).clamp_max(0))
+        inside = (lower <= pixels[-1]).all(-1) & (upper >= pixels[0]).all(-1) & (projected.opacities >= ALPHA_MIN)
+        covering = projected.select(torch.nonzero(inside)[:, 0])
+        dx, dy = (covering.means2d - pixels[:, None]).unbind(-1)
+        a, b, c = covering.conics.unbind(-1)
+        alphas = covering.opacities * torch.exp((-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy).clamp_max(0))
         alphas = torch.where(alphas >= ALPHA_MIN, alphas.clamp_max(ALPHA_MAX), 0)
         touched = (alphas > 0).any(0)
         alphas = alphas[:, touched]

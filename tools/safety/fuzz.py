@@ -120,7 +120,7 @@ class Tally:
 # --- one input ---
 
 
-def allowed_bytes(data: bytes) -> int:
+def compute_max_decoder_bytes(data: bytes) -> int:
     """Return the largest number of bytes that decoding may allocate at one time."""
     declared = 0
     if len(data) >= 48:
@@ -155,16 +155,16 @@ def check_model(model: HybridModel | MergedModel) -> None:
 
 def _check_part(model: HybridModel) -> None:
     state = model.state_dict()
-    again = decode_model(encode_model(model, "raw"))
-    again_values = again.state_dict()
+    reloaded = decode_model(encode_model(model, "raw"))
+    reloaded_values = reloaded.state_dict()
     for name, values in state.items():
         if not torch.isfinite(values).all():
             raise Failure(f"{name} is not finite")
-        if not torch.equal(values, again_values[name]):
+        if not torch.equal(values, reloaded_values[name]):
             raise Failure(f"{name} differs after a round trip through profile raw")
     if model.exposure is None:
         return
-    if again.exposure is None or encode_exposure(again.exposure) != encode_exposure(model.exposure):
+    if reloaded.exposure is None or encode_exposure(reloaded.exposure) != encode_exposure(model.exposure):
         raise Failure("the exposure map differs after a round trip through profile raw")
     for position in (np.zeros(3), np.full(3, 1e30)):
         gains = model.exposure.predict_log_gains(position, np.array([0.0, 0.0, 1.0]))
@@ -182,7 +182,7 @@ def check_memory(data: bytes) -> tuple[int, float]:
         tracemalloc.stop()
     if not isinstance(outcome, str):  # tracemalloc does not see torch's memory
         peak += sum(4 * values.numel() for part in parts_of(outcome) for values in part.state_dict().values())
-    allowed = allowed_bytes(data)
+    allowed = compute_max_decoder_bytes(data)
     if peak > allowed:
         raise Failure(f"{peak:,} bytes were allocated at once, and {allowed:,} are allowed")
     return peak, peak / allowed
@@ -233,7 +233,7 @@ def examine_input(number: int, seed: int, tally: Tally, folder: Path) -> None:
         signal.setitimer(signal.ITIMER_PROF, 0)
         tally.slowest = max(tally.slowest, (taken, number))
         if isinstance(outcome, str):
-            tally.refused[message_pattern(outcome)] += 1
+            tally.refused[generalize_message(outcome)] += 1
         else:
             tally.decoded[kind] += 1
             check_model(outcome)
@@ -257,7 +257,7 @@ def examine_input(number: int, seed: int, tally: Tally, folder: Path) -> None:
         signal.setitimer(signal.ITIMER_PROF, 0)
 
 
-def message_pattern(message: str) -> str:
+def generalize_message(message: str) -> str:
     """Replace the names and numbers of one file in a message, so that equal refusals are counted together."""
     message = message.removeprefix("the data: ")
     message = re.sub(r"(?<=section )'(\w{4})'", r"<\1>", message)

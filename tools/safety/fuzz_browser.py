@@ -39,7 +39,7 @@ from hyrfpack.format.parts import decode_parts
 from hyrfpack.format.sections import SECTION_CONTENTS
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import parts_of
-from tools.safety.fuzz import MAX_MESSAGE_CHARACTERS, message_pattern
+from tools.safety.fuzz import MAX_MESSAGE_CHARACTERS, generalize_message
 from tools.safety.fuzz_mutate import make_hostile_file
 
 READER_SCRIPT = Path(__file__).parent / "read_many.mjs"
@@ -102,8 +102,8 @@ def read_in_javascript(files: Sequence[tuple[bytes, bool]]) -> list[Verdict]:
     """
     verdicts: list[Verdict] = []
     while len(verdicts) < len(files):
-        read, failed = _read_until_end(files[len(verdicts) :])
-        verdicts += read
+        batch_verdicts, failed = _read_until_end(files[len(verdicts) :])
+        verdicts += batch_verdicts
         if failed:
             verdicts.append(Verdict(failed=failed))
     return verdicts
@@ -118,8 +118,8 @@ def _read_until_end(files: Sequence[tuple[bytes, bool]]) -> tuple[list[Verdict],
         with output.open("wb") as stdout, errors.open("wb") as stderr:
             command = ["node", str(READER_SCRIPT), str(batch)]
             try:
-                run = subprocess.run(command, stdout=stdout, stderr=stderr, timeout=NODE_BATCH_TIMEOUT_SECONDS)
-                end = f"exit code {run.returncode}"
+                process = subprocess.run(command, stdout=stdout, stderr=stderr, timeout=NODE_BATCH_TIMEOUT_SECONDS)
+                end = f"exit code {process.returncode}"
             except subprocess.TimeoutExpired:
                 end = f"not done within {NODE_BATCH_TIMEOUT_SECONDS} s"
         answers = [json.loads(line) for line in output.read_text("utf-8", "replace").split("\n")[:-1]]
@@ -195,7 +195,7 @@ def compare(numbers: Sequence[int], seed: int = 0) -> Tally:
         kind, python = inputs[number][0], read_in_python(data, is_start)
         tally.kinds[kind] += 1
         if javascript.refused:
-            tally.refused[message_pattern(javascript.refused)] += 1
+            tally.refused[generalize_message(javascript.refused)] += 1
         elif not javascript.failed:
             tally.accepted[kind] += 1
         tally.slowest = max(tally.slowest, (javascript.seconds, number))

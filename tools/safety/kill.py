@@ -125,13 +125,13 @@ def read_files(folder: Path) -> dict[str, bytes]:
 
 def wait_for_temporary_files(process: subprocess.Popen, folder: Path, count: int | None = None) -> int:
     """Wait until `count` temporary files have appeared, or the process has ended; return how many appeared."""
-    seen: set[str] = set()
-    while process.poll() is None and (count is None or len(seen) < count):
+    temporary_names: set[str] = set()
+    while process.poll() is None and (count is None or len(temporary_names) < count):
         for folder_path in (folder / name for name in WRITTEN_FOLDERS):
             if folder_path.is_dir():
-                seen.update(name for name in os.listdir(folder_path) if is_temporary_file(name))
+                temporary_names.update(name for name in os.listdir(folder_path) if is_temporary_file(name))
         time.sleep(POLL_INTERVAL_SECONDS)
-    return len(seen)
+    return len(temporary_names)
 
 
 def drop_times(value: Any) -> Any:
@@ -150,31 +150,31 @@ def find_file_fault(name: str, data: bytes, case: Case) -> str | None:
         return "the command does not write this file"
     try:
         if base == CHECKPOINT_FILE:
-            same = hashlib.sha256(data[:-DIGEST_BYTES]).digest() == data[-DIGEST_BYTES:]
+            is_intact = hashlib.sha256(data[:-DIGEST_BYTES]).digest() == data[-DIGEST_BYTES:]
             torch.load(io.BytesIO(data[:-DIGEST_BYTES]), weights_only=True)
         elif base == METRICS_FILE:
-            same = drop_times(json.loads(data)) == drop_times(json.loads(case.new[name]))
+            is_intact = drop_times(json.loads(data)) == drop_times(json.loads(case.new[name]))
         elif base == RECORD:
-            same = set(json.loads(data)["stages"]) <= set(json.loads(case.new[name])["stages"])
+            is_intact = set(json.loads(data)["stages"]) <= set(json.loads(case.new[name])["stages"])
         else:
-            same = data == case.new[name]
+            is_intact = data == case.new[name]
             if name.endswith(".hyrf"):
                 hyrfpack.format.decode_model(data)
             else:
                 Image.open(io.BytesIO(data)).load()
     except Exception as error:
         return f"it cannot be read ({error!r})"
-    return None if same else "it has neither the old bytes nor the new ones"
+    return None if is_intact else "it has neither the old bytes nor the new ones"
 
 
-def find_faults(found: dict[str, bytes], case: Case) -> list[str]:
+def find_faults(files: dict[str, bytes], case: Case) -> list[str]:
     """Return descriptions of all faults in a folder after a kill."""
     faults = [
         f"{name} is missing"
         for name in case.old
-        if name not in found and not name.startswith(f"{MAKE_WORK_FOLDER_NAME}/")
+        if name not in files and not name.startswith(f"{MAKE_WORK_FOLDER_NAME}/")
     ]
-    for name, data in found.items():
+    for name, data in files.items():
         if not is_temporary_file(name) and (reason := find_file_fault(name, data, case)):
             faults.append(f"{name}: {reason}")
     return faults
@@ -198,15 +198,17 @@ def check_rerun(case: Case, out: Path) -> list[str]:
     _, stderr_text = process.communicate()
     if process.returncode:
         return [f"run again, it exits with {process.returncode}: {stderr_text.decode()[-300:]}"]
-    after = read_files(out)
-    faults = [f"run again: {sentence}" for sentence in find_faults(after, case)]
+    final_files = read_files(out)
+    faults = [f"run again: {sentence}" for sentence in find_faults(final_files, case)]
     faults += [
-        f"run again: {name} is left" for name in after if is_temporary_file(name) or name.endswith(CHECKPOINT_FILE)
+        f"run again: {name} is left"
+        for name in final_files
+        if is_temporary_file(name) or name.endswith(CHECKPOINT_FILE)
     ]
     faults += [
         f"run again: {name} is missing or still the old one"
         for name in case.new
-        if after.get(name) == case.old[name] or name not in after
+        if final_files.get(name) == case.old[name] or name not in final_files
     ]
     return faults
 
@@ -226,13 +228,13 @@ def run_trial(case: Case, number: int, seed: int, out: Path) -> Outcome:
             process.wait(random_source.uniform(0, case.seconds))
     process.kill()
     _, stderr_text = process.communicate()
-    found = read_files(out)
-    temporary_files = sum(map(is_temporary_file, found))
+    files = read_files(out)
+    temporary_files = sum(map(is_temporary_file, files))
     outcome = Outcome(
-        classify_moment(found, case, process.returncode == -signal.SIGKILL),
+        classify_moment(files, case, process.returncode == -signal.SIGKILL),
         temporary_files,
         False,
-        find_faults(found, case),
+        find_faults(files, case),
     )
     if process.returncode not in (0, -signal.SIGKILL):
         outcome.faults.append(f"it ended by itself with {process.returncode}: {stderr_text.decode()[-300:]}")
@@ -244,14 +246,14 @@ def run_trial(case: Case, number: int, seed: int, out: Path) -> Outcome:
     return outcome
 
 
-def prepare(work: Path, names: Sequence[str]) -> list[Case]:
+def prepare(work_folder: Path, names: Sequence[str]) -> list[Case]:
     """Make the inputs, run each command twice without a kill for its old and new files, and time the second run."""
-    scene = write_demo_scene(work / "scene", views=10, size=48)
+    scene = write_demo_scene(work_folder / "scene", views=10, size=48)
     cases = []
     for name in names:
 
         def arguments(out: Path, seed: int = 0, name: str = name) -> list[str]:
-            model, packed = work / f"train-{seed}" / MODEL_FILE, work / f"compress-{seed}" / "out.hyrf"
+            model, packed = work_folder / f"train-{seed}" / MODEL_FILE, work_folder / f"compress-{seed}" / "out.hyrf"
             return {
                 "train": ["train", str(scene), "-o", str(out), "--overwrite", "--seed", str(seed), *TRAIN_OPTIONS],
                 "compress": ["compress", str(model), "-o", str(out / "out.hyrf"), "--overwrite"],
@@ -271,7 +273,7 @@ def prepare(work: Path, names: Sequence[str]) -> list[Case]:
 
         case = Case(name, arguments)
         for seed in (1, 0):
-            out = work / f"{name}-{seed}"
+            out = work_folder / f"{name}-{seed}"
             out.mkdir()
             process, started = start_command(arguments(out, seed)), time.perf_counter()
             case.writes = max(1, wait_for_temporary_files(process, out))
@@ -279,7 +281,7 @@ def prepare(work: Path, names: Sequence[str]) -> list[Case]:
             if process.returncode:
                 stderr_text = process.stderr.read().decode()
                 raise SystemExit(f"{' '.join(process.args)}: exit {process.returncode}\n{stderr_text}")
-        case.old, case.new = read_files(work / f"{name}-1"), read_files(work / f"{name}-0")
+        case.old, case.new = read_files(work_folder / f"{name}-1"), read_files(work_folder / f"{name}-0")
         cases.append(case)
     return cases
 
@@ -293,14 +295,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="random seed of the moments (0)")
     parser.add_argument("--jobs", type=int, default=2, help="number of trials at the same time (2)")
     args = parser.parse_args()
-    work = Path(tempfile.mkdtemp(prefix="hyrfpack-kill-"))
+    work_folder = Path(tempfile.mkdtemp(prefix="hyrfpack-kill-"))
     header = ("command", "seconds", "kills", *KILL_MOMENTS, "temporary files", "run again", "violations")
     print(" | ".join(header), flush=True)
     violations = []
-    for case in prepare(work, COMMAND_NAMES[: 1 + max(map(COMMAND_NAMES.index, args.commands))]):
+    for case in prepare(work_folder, COMMAND_NAMES[: 1 + max(map(COMMAND_NAMES.index, args.commands))]):
         if case.name not in args.commands:
             continue
-        folders = [work / f"{case.name}-trial-{number}" for number in range(args.kills)]
+        folders = [work_folder / f"{case.name}-trial-{number}" for number in range(args.kills)]
         with ThreadPoolExecutor(args.jobs) as pool:
             outcomes = list(
                 pool.map(run_trial, [case] * args.kills, range(args.kills), [args.seed] * args.kills, folders)
@@ -320,9 +322,9 @@ def main() -> None:
         print(" | ".join(f"{value:>{len(title)}}" for title, value in zip(header, row, strict=True)), flush=True)
         violations += faults
     if violations:
-        print("\n".join(violations), f"the files of the failed trials are in {work}", sep="\n")
+        print("\n".join(violations), f"the files of the failed trials are in {work_folder}", sep="\n")
         sys.exit(1)
-    shutil.rmtree(work)
+    shutil.rmtree(work_folder)
 
 
 if __name__ == "__main__":

@@ -136,14 +136,14 @@ def check_command(command: Command, output: Path, running: RunningCommand) -> Ou
     """Wait for a command and check its exit code, its output file and its error message."""
     code, stdout_text, stderr_text = running.wait()
     if code == 0:
-        written = find_written_file(output, stdout_text)
-        beside = written.name != (MODEL_FILE if output.is_dir() else output.name)
-        data = written.read_bytes() if written.is_file() else b""
-        faults = [] if data == command.expected else [f"exit code 0, and {written.name} does not hold its result"]
-        return Outcome("beside" if beside else "written", faults)
+        written_file = find_written_file(output, stdout_text)
+        has_other_name = written_file.name != (MODEL_FILE if output.is_dir() else output.name)
+        data = written_file.read_bytes() if written_file.is_file() else b""
+        faults = [] if data == command.expected else [f"exit code 0, and {written_file.name} does not hold its result"]
+        return Outcome("beside" if has_other_name else "written", faults)
     errors = [line for line in stderr_text.splitlines() if line.startswith("Error: ")]
-    known = len(errors) == 1 and (FOLDER_BUSY_TEXT in errors[0] or OUTPUT_EXISTS_TEXT in errors[0])
-    faults = [] if code == 2 and known else [f"exit code {code}: {stderr_text[-300:]}"]
+    is_expected = len(errors) == 1 and (FOLDER_BUSY_TEXT in errors[0] or OUTPUT_EXISTS_TEXT in errors[0])
+    faults = [] if code == 2 and is_expected else [f"exit code {code}: {stderr_text[-300:]}"]
     return Outcome("refused, busy" if errors and FOLDER_BUSY_TEXT in errors[0] else "refused, exists", faults)
 
 
@@ -155,7 +155,7 @@ def race_commands(race: Race, folder: Path, random_source: random.Random, togeth
     if not together:
         time.sleep(random_source.uniform(0, order[0].seconds))
     running.append(start_command(order[1], output))
-    ends = [check_command(command, output, one) for command, one in zip(order, running, strict=True)]
+    ends = [check_command(command, output, process) for command, process in zip(order, running, strict=True)]
     faults = [sentence for end in ends for sentence in end.faults]
     if not any(end.label == "written" for end in ends):
         faults.append("none of them has written its output")
@@ -194,10 +194,10 @@ def wait_for_success(running: RunningCommand) -> str:
     return stdout_text
 
 
-def prepare(work: Path) -> dict[str, Race]:
+def prepare(work_folder: Path) -> dict[str, Race]:
     """Make the inputs, and run every command once undisturbed for its expected bytes and duration."""
-    scene, run = write_demo_scene(work / "scene", views=10, size=48), work / "run"
-    model, packed = str(run / MODEL_FILE), str(work / "packed.hyrf")
+    scene, run = write_demo_scene(work_folder / "scene", views=10, size=48), work_folder / "run"
+    model, packed = str(run / MODEL_FILE), str(work_folder / "packed.hyrf")
     wait_for_success(RunningCommand(["train", str(scene), "-o", str(run), *TRAIN_OPTIONS]))
     wait_for_success(RunningCommand(["compress", model, "-o", packed, "--profile", "paper"]))
 
@@ -217,7 +217,7 @@ def prepare(work: Path) -> dict[str, Race]:
     }
     for name, race in races.items():
         for number, command in enumerate(race.commands):
-            output = work / f"{name}-{number}" / race.output
+            output = work_folder / f"{name}-{number}" / race.output
             output.parent.mkdir()
             started = time.perf_counter()
             stdout_text = wait_for_success(start_command(command, output))
@@ -233,17 +233,17 @@ def main() -> None:
     parser.add_argument("--races", nargs="+", choices=names, default=names, help="races to run (all)")
     parser.add_argument("--seed", type=int, default=0, help="random seed of the moments (0)")
     args = parser.parse_args()
-    work = Path(tempfile.mkdtemp(prefix="hyrfpack-races-"))
+    work_folder = Path(tempfile.mkdtemp(prefix="hyrfpack-races-"))
     violations = []
-    for name, race in prepare(work).items():
+    for name, race in prepare(work_folder).items():
         if name not in args.races:
             continue
         counts: Counter[str] = Counter()
         for number in range(args.rounds):
-            folder = work / f"{name}-round-{number}"
+            folder = work_folder / f"{name}-round-{number}"
             folder.mkdir()
-            run = race_commands if len(race.commands) == 2 else race_with_file
-            outcome = run(race, folder, random.Random(f"{args.seed} {name} {number}"), number % 2 == 0)
+            run_race = race_commands if len(race.commands) == 2 else race_with_file
+            outcome = run_race(race, folder, random.Random(f"{args.seed} {name} {number}"), number % 2 == 0)
             outcome.faults += [f"{path.name} is left" for path in folder.rglob("*") if is_temporary_file(path.name)]
             counts[outcome.label] += 1
             violations += [f"{folder.name}: {sentence}" for sentence in outcome.faults]
@@ -253,9 +253,9 @@ def main() -> None:
         print(f"{name}, {args.rounds} rounds: {summary}", flush=True)
     print(f"violations: {len(violations)}")
     if violations:
-        print("\n".join(violations), f"the files of the failed rounds are in {work}", sep="\n")
+        print("\n".join(violations), f"the files of the failed rounds are in {work_folder}", sep="\n")
         sys.exit(1)
-    shutil.rmtree(work)
+    shutil.rmtree(work_folder)
 
 
 if __name__ == "__main__":

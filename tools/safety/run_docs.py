@@ -72,8 +72,8 @@ def run_page(page: Path, data: Path, steps: int | None) -> bool:
         else:
             write_demo_scene(photos)
         script.write_text(code, encoding="utf-8")
-        fewer = [] if steps is None else ["-c", FEWER_STEPS_SCRIPT.format(steps=steps)]
-        return subprocess.run([sys.executable, *fewer, script], cwd=folder).returncode == 0
+        step_options = [] if steps is None else ["-c", FEWER_STEPS_SCRIPT.format(steps=steps)]
+        return subprocess.run([sys.executable, *step_options, script], cwd=folder).returncode == 0
 
 
 def main() -> int:
@@ -90,9 +90,12 @@ def main() -> int:
     for page in args.pages:
         print(f"== {page}", flush=True)
         started = time.perf_counter()
-        done = run_page(page, args.data, args.steps)
-        broken += not done
-        print(f"== {page}: {'ran as written' if done else 'FAILED'}, {time.perf_counter() - started:.0f} s", flush=True)
+        succeeded = run_page(page, args.data, args.steps)
+        broken += not succeeded
+        print(
+            f"== {page}: {'ran as written' if succeeded else 'FAILED'}, {time.perf_counter() - started:.0f} s",
+            flush=True,
+        )
     return min(broken, 1)
 
 

@@ -40,8 +40,8 @@ def check_saving(folder: Path) -> str:
     """Write a model, read it again and compare the numbers."""
     model = hyrfpack.load_model(TRAINED_FILE)
     hyrfpack.save_model(model, folder / "saved.hyrf")
-    again = hyrfpack.load_model(folder / "saved.hyrf").state_dict()
-    assert all(np.array_equal(values, again[name]) for name, values in model.state_dict().items())
+    loaded = hyrfpack.load_model(folder / "saved.hyrf").state_dict()
+    assert all(np.array_equal(values, loaded[name]) for name, values in model.state_dict().items())
     return f"{len(model):,} Gaussians are the same after writing and reading"
 
 

@@ -81,8 +81,8 @@ def quantize_uniformly(model: HybridModel, step: float) -> QuantizedModel:
     arrays = to_arrays(model)
     ones = {group: np.ones(values.size) for group, values in arrays.items()}
     distortion = step**2 / 12 * sum(values.size for values in arrays.values())
-    one = np.ones(len(model))
-    sensitivity = Sensitivity(one, one, one, one, removals=one, fields=ones)
+    unit = np.ones(len(model))
+    sensitivity = Sensitivity(unit, unit, unit, unit, removals=unit, fields=ones)
     return plan_and_quantize(model, sensitivity, distortion, prune=False)
 
 

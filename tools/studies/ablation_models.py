@@ -125,14 +125,14 @@ class HarmonicColors(HybridModel):
         if index is not None:
             positions, stored = take_rows(positions, index, used), take_rows(stored, index, used)
         offsets = self._field_positions(positions) - viewpoint
-        basis = harmonics_to_degree_3(torch.nn.functional.normalize(offsets, dim=-1, eps=1e-12))
+        basis = evaluate_harmonics_to_degree_3(torch.nn.functional.normalize(offsets, dim=-1, eps=1e-12))
         rates = basis.new_full((SH_COEFFICIENTS,), SH_REST_RATE_RATIO)
         rates[0] = 1
         coefficients = stored.view(-1, SH_COEFFICIENTS, 3)
         return (torch.einsum("nk,nkc->nc", basis * rates, coefficients) + 0.5).clamp_min(0)
 
 
-def harmonics_to_degree_3(directions: Tensor) -> Tensor:
+def evaluate_harmonics_to_degree_3(directions: Tensor) -> Tensor:
     """Return the orthonormal real spherical harmonics of bands 0 to 3, (N, 16), at unit vectors (N, 3)."""
     x, y, z = directions.unbind(-1)
     band = torch.stack(
@@ -238,9 +238,9 @@ def _replace_model(model: HybridModel, kind: type[HybridModel], seed: int) -> Hy
     start = model.radiance.biases[-1].detach()
     if kind is not SingleField:
         model.gaussians.color_logits.add_(start)
-    other = kind(model.config, model.gaussians, torch.Generator().manual_seed(seed))
-    other.radiance.biases[-1][: len(start)] = start
-    return other
+    replaced = kind(model.config, model.gaussians, torch.Generator().manual_seed(seed))
+    replaced.radiance.biases[-1][: len(start)] = start
+    return replaced
 
 
 @torch.no_grad()

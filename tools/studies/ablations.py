@@ -158,7 +158,7 @@ def format_quality_table(results: Results, sets: Sequence[str], variants: Sequen
     for variant in variants:
         cells, means = [], []
         for name in sets:
-            pairs = _pairs(results, variant, name)
+            pairs = _pair_results(results, variant, name)
             differences = [ours["psnr"] - full["psnr"] for ours, full in pairs]
             means += [fmean(differences)] if pairs else []
             failed = sum("failed" in result for result in results[variant.name, name])
@@ -175,7 +175,7 @@ def format_cost_table(results: Results, sets: Sequence[str], variants: Sequence[
     """Format size and speed of each variant relative to the full model: means over data sets and seeds."""
 
     def ratio(variant: Variant, key: str, full_key: str | None = None) -> str:
-        pairs = [pair for name in sets for pair in _pairs(results, variant, name) if key in pair[0]]
+        pairs = [pair for name in sets for pair in _pair_results(results, variant, name) if key in pair[0]]
         return f"{fmean(ours[key] / (full[full_key] if full_key else 1) for ours, full in pairs):.2f}" if pairs else ""
 
     columns = ("part of full", "size, paper", "size", "frames/s, paper", "frames/s", "steps/s")
@@ -211,7 +211,7 @@ def format_details_table(results: Results, name: str, variants: Sequence[Variant
     return markdown_table(columns, rows)
 
 
-def _pairs(results: Results, variant: Variant, name: str) -> list[tuple[dict, dict]]:
+def _pair_results(results: Results, variant: Variant, name: str) -> list[tuple[dict, dict]]:
     """Return the results of the variant and of the full model for each seed with which both were trained."""
     both = zip(results[variant.name, name], results[FULL_VARIANT.name, name], strict=True)
     return [pair for pair in both if not any("failed" in result for result in pair)]

@@ -44,10 +44,9 @@ def thin(scene: Scene, photos: int, points: int, rng: np.random.Generator) -> Sc
     views = evenly_spaced(scene.train, photos)
     source = np.sort(rng.integers(len(scene.points), size=points))
     tracks = {view.name: np.flatnonzero(np.isin(source, scene.tracks[view.name])) for view in views}
-    places = scene.points[source] + rng.normal(0, JITTER_METRES, (points, 3))
-    return replace(
-        scene, train=views, test=[], points=places, point_colors=scene.point_colors[source], tracks=tracks, reading={}
-    )
+    positions = scene.points[source] + rng.normal(0, JITTER_METRES, (points, 3))
+    colors = scene.point_colors[source]
+    return replace(scene, train=views, test=[], points=positions, point_colors=colors, tracks=tracks, reading={})
 
 
 def tile(scene: Scene, tiles: int) -> Scene:

@@ -154,8 +154,8 @@ def measure_curve(
 ) -> list[tuple[float, int]]:
     """Return (PSNR, bytes) for rising budgets, until the last target or the finest level is reached."""
     curve: list[tuple[float, int]] = []
-    most, budget = sum(counts[0] for counts in scene.counts), float(sum(counts[-1] for counts in scene.counts))
-    while not curve or (curve[-1][0] < TARGETS_DB[-1] and budget < ratio * most):
+    total_count, budget = sum(counts[0] for counts in scene.counts), float(sum(counts[-1] for counts in scene.counts))
+    while not curve or (curve[-1][0] < TARGETS_DB[-1] and budget < ratio * total_count):
         choices = [choose_levels(scene.counts, scene.predict(camera), budget)[0] for camera in cameras]
         errors = measure_errors(scene, choices, cameras, targets)
         curve.append((mean_psnr(errors), scene.count_bytes(choices)))
@@ -164,8 +164,8 @@ def measure_curve(
     return curve
 
 
-def least_bytes(curve: Sequence[tuple[float, int]], target: float) -> str:
-    """Return the least bytes of a point with at least a PSNR; "never" if there is none."""
+def format_min_bytes(curve: Sequence[tuple[float, int]], target: float) -> str:
+    """Format the smallest number of bytes with which a curve reaches a PSNR; "never" if it does not."""
     sizes = [size for psnr, size in curve if psnr >= target]
     return f"{min(sizes):,}" if sizes else "never"
 
@@ -184,7 +184,7 @@ def make_row(
     else:
         psnr = "exact"
     curve = measure_curve(scene, cameras, targets, ratio)
-    cells = [least_bytes(curve, target) for target in TARGETS_DB]
+    cells = [format_min_bytes(curve, target) for target in TARGETS_DB]
     return [name, *cells, psnr, f"{scene.count_bytes(finest):,}"]
 
 

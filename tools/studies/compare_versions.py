@@ -96,9 +96,9 @@ def train_and_score(
         compile_kernels(version, scene.path, tuple(options))
         command_options = ["--steps", str(steps), "--seed", str(seed), "--overwrite", *options]
         budget = [] if gaussians is None else ["--max-gaussians", str(gaussians)]
-        before = children_cpu_seconds()
+        start_seconds = children_cpu_seconds()
         _run_command(version, "train", str(scene.path), "-o", str(out), *command_options, *budget)
-        cpu_time.write_text(json.dumps(children_cpu_seconds() - before))
+        cpu_time.write_text(json.dumps(children_cpu_seconds() - start_seconds))
     default_file, packed = out / "compact.hyrf", out / f"compact{suffix}.hyrf"
     packed.unlink(missing_ok=True)
     limit = [] if size == 1 else ["--target-size", str(round(size * default_file.stat().st_size))]

@@ -153,12 +153,12 @@ def format_table(rows: list[dict]) -> str:
     for row in rows:
         cells = [row["set"], f"{row['gaussians']:,}", f"{row['psnr']:.2f} / {row['ssim']:.4f}"]
         for kind in kinds:
-            made = row[kind]
-            if made is None:
+            measured = row[kind]
+            if measured is None:
                 cells.append("not reached")
                 continue
-            share = "" if kind == "paper" else f" ({made['bytes'] / row['paper']['bytes']:.3f})"
-            cells.append(f"{made['bytes']:,}{share}, {made['drop']:+.3f}, {made['ssim_drop']:+.4f}")
+            share = "" if kind == "paper" else f" ({measured['bytes'] / row['paper']['bytes']:.3f})"
+            cells.append(f"{measured['bytes']:,}{share}, {measured['drop']:+.3f}, {measured['ssim_drop']:+.4f}")
         default = row["default"]
         cells.append(f"{default['measured_error'] / default['predicted_error']:.2f}")
         cells.append(f"{row['measuring']:.1f} + {default['seconds']:.1f}")

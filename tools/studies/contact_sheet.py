@@ -64,10 +64,10 @@ def main() -> None:
     args = parser.parse_args()
     rows = []
     with torch.no_grad():
-        for run in args.runs:
-            if (run / "compact.hyrf").is_file():
-                model = hyrfpack.load_model(run / "compact.hyrf")
-                rows.append(draw_worst_view(run.name, load_variant(args.data, run.name), model))
+        for folder in args.runs:
+            if (folder / "compact.hyrf").is_file():
+                model = hyrfpack.load_model(folder / "compact.hyrf")
+                rows.append(draw_worst_view(folder.name, load_variant(args.data, folder.name), model))
     if not rows:
         parser.error("none of the folders has a compact.hyrf; make the runs with tools.studies.train_sets")
     save_picture(args.output, stack_pictures(rows))

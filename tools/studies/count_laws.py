@@ -116,12 +116,12 @@ def format_fits(rows: Sequence[CountRow]) -> str:
     """Format the least-squares fits of PSNR and bytes against the number of Gaussians, for each photo size."""
     cells = []
     for size in dict.fromkeys(row.size for row in rows):
-        own = [row for row in rows if row.size == size]
-        if len(own) < 2:
+        size_rows = [row for row in rows if row.size == size]
+        if len(size_rows) < 2:
             continue
-        counts = np.array([row.gaussians for row in own], float)
-        slope, start = np.polyfit(np.log2(counts), [row.psnr for row in own], 1)
-        marginal, fixed = np.polyfit(counts, [row.bytes for row in own], 1)
+        counts = np.array([row.gaussians for row in size_rows], float)
+        slope, start = np.polyfit(np.log2(counts), [row.psnr for row in size_rows], 1)
+        marginal, fixed = np.polyfit(counts, [row.bytes for row in size_rows], 1)
         bits = f"{8 * marginal:.1f} bits a Gaussian and {fixed:,.0f} bytes"
         cells.append([f"{size}", f"{start:.2f} + {slope:.2f} log2(N) dB", bits])
     return markdown_table(("pixels", "PSNR", "size of the file"), cells)

@@ -60,8 +60,8 @@ class Sphere:
 
 
 def _median_depth(model: HybridModel, camera: Camera) -> np.ndarray:
-    seen = render_view(model, camera)
-    index = seen.indices[seen.visible]
+    rendered = render_view(model, camera)
+    index = rendered.indices[rendered.visible]
     return render_median_depth(model, camera, model.decode(), index, RenderSettings()).numpy()
 
 

@@ -120,8 +120,8 @@ def main() -> None:
         f"in {SPLIT_STEPS} steps (seed {args.seed}), then {args.final_steps} steps without splitting",
     }
     provenance["viewpoint"] = Viewpoint.from_cameras([view.camera for view in scene.train]).to_json()
-    written = hyrfpack.save_model(model, args.out / MODEL_FILE, profile="raw", provenance=provenance)
-    print(f"{args.out / MODEL_FILE}: {written.bytes_after:,} bytes")
+    report = hyrfpack.save_model(model, args.out / MODEL_FILE, profile="raw", provenance=provenance)
+    print(f"{args.out / MODEL_FILE}: {report.bytes_after:,} bytes")
 
 
 if __name__ == "__main__":

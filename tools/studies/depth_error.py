@@ -24,7 +24,7 @@ from hyrfpack.scene import Camera, Scene
 from tools.command import run_command
 from tools.scenes.catalog import LAYOUTS, make_scene
 from tools.scenes.render import cast_pixels
-from tools.studies.mesh_error import compute_demo_depth, format_statistics, nearest_surface
+from tools.studies.mesh_error import compute_demo_depth, find_nearest_surface, format_statistics
 from tools.tables import markdown_table
 
 MAX_DEMO_DEPTH = 6
@@ -57,7 +57,7 @@ def compute_demo_geometry(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     depth = compute_demo_depth(camera)
     depth[depth >= MAX_DEMO_DEPTH] = np.inf
     points = make_rays(camera) * np.where(np.isfinite(depth), depth, 1)[..., None] - camera.camera_from_world[:3, 3]
-    _, normals = nearest_surface((points @ camera.rotation).reshape(-1, 3))
+    _, normals = find_nearest_surface((points @ camera.rotation).reshape(-1, 3))
     return depth, normals.reshape(*depth.shape, 3)
 
 
@@ -83,19 +83,19 @@ def print_errors(model: HybridModel, cameras: list[Camera], geometry: Geometry) 
     settings = RenderSettings().raster_settings(model.config.antialiased)
     for camera in cameras:
         exact, exact_normals = geometry(camera)
-        seen = render_view(model, camera, decoded=decoded, depth=True)
-        assert seen.depth is not None
-        gaussians, _ = surface.drawn_gaussians(model, camera, decoded, seen.indices[seen.visible])
+        rendered = render_view(model, camera, decoded=decoded, depth=True)
+        assert rendered.depth is not None
+        gaussians, _ = surface.drawn_gaussians(model, camera, decoded, rendered.indices[rendered.visible])
         depth, _ = surface.render_surface(gaussians, frame, camera, settings, normals=False)
-        known = np.isfinite(exact) & (depth.numpy() > 0)
-        for name, found in (("expected", seen.depth), ("median", depth)):
-            depth_errors[name].append(np.abs(found.numpy() - exact)[known] / exact[known])
+        has_depth = np.isfinite(exact) & (depth.numpy() > 0)
+        for name, measured in (("expected", rendered.depth), ("median", depth)):
+            depth_errors[name].append(np.abs(measured.numpy() - exact)[has_depth] / exact[has_depth])
         rays = make_rays(camera) @ camera.rotation
         faces_away = (exact_normals * rays).sum(axis=-1, keepdims=True) > 0
         exact_normals = np.where(faces_away, -exact_normals, exact_normals)
         for name, weight in DEPTH_NORMAL_WEIGHTS.items():
             normals = surface.render_normals(gaussians, depth, frame, camera, settings, depth_weight=weight)
-            cosines = (normals.numpy() * exact_normals).sum(axis=-1)[known]
+            cosines = (normals.numpy() * exact_normals).sum(axis=-1)[has_depth]
             angles[name].append(np.degrees(np.arccos(cosines.clip(-1, 1))))
     rows = [[name, *format_statistics(np.concatenate(parts))] for name, parts in depth_errors.items()]
     print(markdown_table(["depth, relative error", "mean", "median", "95 %"], rows) + "\n")

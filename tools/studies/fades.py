@@ -72,11 +72,11 @@ def measure(folder: Path) -> list[list[str]]:
         browser.evaluate(frame_observer_script("comparedFrames.add"))
         browser.evaluate("hyrfpack.player.redraw()")
         browser.evaluate("hyrfpack.player.settled.then(() => true)")
-        for before, after in zip(budgets, budgets[1:], strict=False):
-            change, *neighbours = change_budget(browser, after)
+        for budget, next_budget in zip(budgets, budgets[1:], strict=False):
+            change, *neighbours = change_budget(browser, next_budget)
             different = [psnr for psnr in neighbours if psnr < 60]
             cells = [f"{change:.1f}", str(len(different)), f"{min(neighbours, default=99):.1f}"]
-            rows.append([folder.name, f"{before:,}", f"{after:,}", *cells])
+            rows.append([folder.name, f"{budget:,}", f"{next_budget:,}", *cells])
             print(rows[-1], flush=True)
     return rows
 

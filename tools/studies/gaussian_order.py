@@ -70,7 +70,7 @@ def measure_steps(scene: Scene, models: dict[str, HybridModel], steps: int) -> d
     return {name: values[WARMUP_STEPS:] for name, values in seconds.items()}
 
 
-def share_of_runs(coords: np.ndarray, grid: HashGridConfig, group: int) -> float:
+def measure_run_share(coords: np.ndarray, grid: HashGridConfig, group: int) -> float:
     """Return how many runs of points in the same cell there are for each point (N, 3), mean of levels.
 
     A run consists of consecutive points and ends with its group of points.
@@ -95,7 +95,7 @@ def hash_rows(coords: np.ndarray, grid: HashGridConfig) -> np.ndarray:
     return np.stack(rows)
 
 
-def share_of_distinct(values: np.ndarray) -> float:
+def measure_distinct_share(values: np.ndarray) -> float:
     """Return the share of values (..., n) that are the first of their kind in their row."""
     ordered = np.sort(values, axis=-1)
     return float((np.count_nonzero(np.diff(ordered, axis=-1)) + ordered[..., 0].size) / ordered.size)
@@ -103,8 +103,8 @@ def share_of_distinct(values: np.ndarray) -> float:
 
 def count_rows(model: HybridModel, scene: Scene) -> tuple[float, ...]:
     """Return the shares of distinct rows of a block, of distinct sectors of an access, and of runs: thread, block."""
-    seen = gaussians_in_view(model, scene.train[0].camera)
-    coords = model.cube_coords(model.gaussians.positions.detach()[seen]).numpy()
+    visible_index = gaussians_in_view(model, scene.train[0].camera)
+    coords = model.cube_coords(model.gaussians.positions.detach()[visible_index]).numpy()
     coords = coords[: len(coords) // POINTS_PER_BLOCK * POINTS_PER_BLOCK]
     rows = hash_rows(coords, model.config.radiance)
     levels = len(rows)
@@ -112,8 +112,10 @@ def count_rows(model: HybridModel, scene: Scene) -> tuple[float, ...]:
         rows.reshape(levels, 8, -1, POINTS_PER_BLOCK).transpose(0, 2, 1, 3).reshape(levels, -1, 8 * POINTS_PER_BLOCK)
     )
     accesses = rows.reshape(levels, 8, -1, POINTS_PER_ACCESS) // ROWS_PER_SECTOR
-    runs = (share_of_runs(coords, model.config.radiance, group) for group in (POINTS_PER_THREAD, POINTS_PER_BLOCK))
-    return share_of_distinct(blocks), share_of_distinct(accesses), *runs
+    run_shares = (
+        measure_run_share(coords, model.config.radiance, group) for group in (POINTS_PER_THREAD, POINTS_PER_BLOCK)
+    )
+    return measure_distinct_share(blocks), measure_distinct_share(accesses), *run_shares
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -132,17 +132,18 @@ def compare_at_equal_psnr(points: list[MeasuredFile], other_files: list[Measured
     """
     curve = sorted((file.psnr, file.bytes) for file in points)
     decibels, sizes = (np.array(values) for values in zip(*curve, strict=True))
-    for other in other_files:
-        if decibels[0] <= other.psnr <= decibels[-1]:
-            size = float(np.exp(np.interp(other.psnr, decibels, np.log(sizes))))
-            comparison = f"hyrfpack needs {size / other.bytes:.3f} of these bytes"
+    for measured in other_files:
+        if decibels[0] <= measured.psnr <= decibels[-1]:
+            size = float(np.exp(np.interp(measured.psnr, decibels, np.log(sizes))))
+            comparison = f"hyrfpack needs {size / measured.bytes:.3f} of these bytes"
         else:
             comparison = (
                 "no file of hyrfpack reaches this PSNR"
-                if other.psnr > decibels[-1]
+                if measured.psnr > decibels[-1]
                 else "all files of hyrfpack are better"
             )
-        yield f"- {other.encoder}, {other.setting}, {other.bytes:,} bytes, {other.psnr:.2f} dB: {comparison}"
+        label = f"{measured.encoder}, {measured.setting}, {measured.bytes:,} bytes, {measured.psnr:.2f} dB"
+        yield f"- {label}: {comparison}"
 
 
 def compare_file(path: Path, config: ImportConfig, psnr_targets: list[float]) -> None:

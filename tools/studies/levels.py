@@ -61,10 +61,10 @@ def measure_finest(name: str, file: Path, folder: Path, scene: Scene, report: hy
     """Return the cells of a row of the first table."""
     model, finest = hyrfpack.load_model(file), hyrfpack.load_model(folder)
     cameras = [view.camera for view in evenly_spaced(scene.test, PATH_VIEWS)]
-    same = mean_psnr(compare(render_all(model, cameras), render_all(finest, cameras)))
+    psnr_to_model = mean_psnr(compare(render_all(model, cameras), render_all(finest, cameras)))
     photos = [hyrfpack.evaluate_model(each, scene.test).psnr for each in (model, finest)]
     sizes = (report.bytes_source, report.bytes_finest, report.bytes)
-    cells = [f"{size:,}" for size in sizes] + [f"{same:.1f}", *(f"{psnr:.3f}" for psnr in photos)]
+    cells = [f"{size:,}" for size in sizes] + [f"{psnr_to_model:.1f}", *(f"{psnr:.3f}" for psnr in photos)]
     return [name, f"{report.gaussians:,}", str(report.chunks), *cells]
 
 

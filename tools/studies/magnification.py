@@ -24,7 +24,7 @@ from tools.tables import markdown_table
 PHOTO_REDUCTION = 2
 
 
-def without_photo_sampling(model: hyrfpack.HybridModel) -> hyrfpack.HybridModel:
+def remove_photo_sampling(model: hyrfpack.HybridModel) -> hyrfpack.HybridModel:
     """Forget how finely the photos sampled a model, and return the model."""
     model.gaussians.pixel_sizes = None
     model.background_spacing = 0.0
@@ -43,7 +43,7 @@ def measure(data: Path, steps: int, seed: int, out: Path) -> list[tuple[float, f
         hyrfpack.compress_model(out / "model.hyrf", packed)
     columns = []
     for scene in (reduced, photos):
-        for model in (without_photo_sampling(hyrfpack.load_model(packed)), hyrfpack.load_model(packed)):
+        for model in (remove_photo_sampling(hyrfpack.load_model(packed)), hyrfpack.load_model(packed)):
             scores = hyrfpack.evaluate_model(model, scene.test)
             columns.append((scores.psnr, scores.ssim))
     return columns

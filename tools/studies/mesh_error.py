@@ -69,8 +69,8 @@ def main() -> None:
         return
     start, processor = time.perf_counter(), time.process_time()
     if arguments.mesh:
-        read = trimesh.load(arguments.mesh, process=False)
-        mesh = Mesh(np.asarray(read.vertices), np.asarray(read.faces), np.zeros((0, 3), np.uint8), 0.0, 0.0, 0)
+        loaded = trimesh.load(arguments.mesh, process=False)
+        mesh = Mesh(np.asarray(loaded.vertices), np.asarray(loaded.faces), np.zeros((0, 3), np.uint8), 0.0, 0.0, 0)
     else:
         mesh = extract_mesh(
             source.model, source.fit_cameras, source.center, voxel=arguments.voxel, faces=arguments.faces
@@ -100,17 +100,17 @@ def write_maps(source: Source, path: Path) -> None:
     )
 
 
-def nearest_surface(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_nearest_surface(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the distance (N,) of points (N, 3) to the demo scene's nearest surface, and its normals (N, 3) there."""
     best, normals = np.abs(points[:, 2]), np.tile((0.0, 0.0, 1.0), (len(points), 1))
     for solid in SOLID_SHAPES:
         local = (points - solid.center) @ solid.object_from_world.T.astype(np.float64)
         half = np.array(solid.half)
         if solid.box:
-            beyond = np.abs(local) - half
-            outside = np.maximum(beyond, 0)
-            distance = np.where(beyond.max(axis=1) > 0, np.linalg.norm(outside, axis=1), -beyond.max(axis=1))
-            axis = beyond.argmax(axis=1)
+            excess = np.abs(local) - half
+            outside = np.maximum(excess, 0)
+            distance = np.where(excess.max(axis=1) > 0, np.linalg.norm(outside, axis=1), -excess.max(axis=1))
+            axis = excess.argmax(axis=1)
             normal = np.zeros_like(local)
             normal[np.arange(len(local)), axis] = np.sign(local[np.arange(len(local)), axis])
         else:
@@ -148,11 +148,11 @@ def print_demo_error(mesh: Mesh, scene: Scene) -> None:
     """Print accuracy, completeness and normal error of a mesh of the demo scene."""
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     samples, faces = trimesh.sample.sample_surface(shape, MESH_SAMPLES, seed=0)
-    accuracy, normals = nearest_surface(samples)
+    accuracy, normals = find_nearest_surface(samples)
     angles = np.degrees(np.arccos(np.clip((shape.face_normals[faces] * normals).sum(axis=1), -1, 1)))
-    seen = np.concatenate([seen_points(view.camera) for view in scene.train])
-    seen = seen[is_in_box(seen, scene)]
-    completeness, _ = cKDTree(samples).query(seen)
+    visible_points = np.concatenate([sample_visible_points(view.camera) for view in scene.train])
+    visible_points = visible_points[is_in_box(visible_points, scene)]
+    completeness, _ = cKDTree(samples).query(visible_points)
     precision, recall = (accuracy < HIT_LIMIT).mean(), (completeness < HIT_LIMIT).mean()
     rows = [
         ["accuracy", *format_statistics(accuracy)],
@@ -166,7 +166,7 @@ def print_demo_error(mesh: Mesh, scene: Scene) -> None:
     )
 
 
-def seen_points(camera: Camera) -> np.ndarray:
+def sample_visible_points(camera: Camera) -> np.ndarray:
     """Return points (n, 3) of the demo scene's surfaces that a camera sees, evenly over its picture."""
     depth = compute_demo_depth(camera)
     stride = max(1, round((depth.size / SURFACE_RAYS_PER_CAMERA) ** 0.5))
@@ -182,18 +182,18 @@ def render_depths(source: Source, camera: Camera) -> dict[str, np.ndarray]:
     model = source.model
     with torch.no_grad():
         decoded = model.decode()
-        seen = render_view(model, camera, decoded=decoded, depth=True)
-        index = seen.indices[seen.visible]
+        rendered = render_view(model, camera, decoded=decoded, depth=True)
+        index = rendered.indices[rendered.visible]
         planes = render_median_depth(model, camera, decoded, index, RenderSettings())
         viewport = model.config.frame.local_viewport(camera)
         gaussians = decoded.geometry[index].at(model.gaussians.positions[index])
         settings = RasterSettings(antialiased=model.config.antialiased)
         flat = torch.zeros_like(gaussians.means)
         centers = cpu.median_depth(gaussians, flat, MAX_PLANE_DEPTH_RATIO, viewport, settings)
-    assert seen.depth is not None
+    assert rendered.depth is not None
     scale = model.config.frame.scale
     return {
-        "expected": seen.depth.numpy(),
+        "expected": rendered.depth.numpy(),
         "median, centres": scale * centers.numpy(),
         "median, planes": planes.numpy(),
     }
@@ -203,24 +203,24 @@ def print_point_error(source: Source, mesh: Mesh, scene: Scene) -> None:
     """Print the errors of depths at the points that were found in held-out views, relative to the depth."""
     errors: dict[str, list[np.ndarray]] = {}
     shares: dict[str, list[np.ndarray]] = {}
-    near = is_in_box(scene.points, scene)
+    is_in_export_box = is_in_box(scene.points, scene)
     for view in scene.test:
         tracks = scene.tracks[view.name]
-        points = scene.points[tracks[near[tracks]]]
+        points = scene.points[tracks[is_in_export_box[tracks]]]
         u, v, z = view.camera.project(points)
         inside = (z > 0) & (u >= 0) & (v >= 0) & (u < view.camera.width) & (v < view.camera.height)
         rows, columns, z = v[inside].astype(int), u[inside].astype(int), z[inside]
         depths = {"mesh": draw_depth(mesh, view.camera), **render_depths(source, view.camera)}
         for name, depth in depths.items():
-            found = depth[rows, columns]
-            known = np.isfinite(found) & (found > 0)
-            errors.setdefault(name, []).append(np.abs(found[known] - z[known]) / z[known])
-            shares.setdefault(name, []).append(known)
+            measured = depth[rows, columns]
+            has_depth = np.isfinite(measured) & (measured > 0)
+            errors.setdefault(name, []).append(np.abs(measured[has_depth] - z[has_depth]) / z[has_depth])
+            shares.setdefault(name, []).append(has_depth)
     rows_out = []
     for name, parts in errors.items():
-        all_errors, known = np.concatenate(parts), np.concatenate(shares[name])
+        all_errors, has_depth = np.concatenate(parts), np.concatenate(shares[name])
         rows_out.append(
-            [name, f"{known.mean():.3f}", *format_statistics(all_errors), f"{(all_errors < 0.02).mean():.3f}"]
+            [name, f"{has_depth.mean():.3f}", *format_statistics(all_errors), f"{(all_errors < 0.02).mean():.3f}"]
         )
     total = sum(len(part) for part in shares["mesh"])
     columns = [f"depth at {total:,} points", "with depth", "mean", "median", "95 %", "within 2 %"]

@@ -85,8 +85,8 @@ def write_model(path: Path, count: int, seed: int) -> None:
         for parameter in (*model.geometry.parameters(), *model.radiance.parameters()):
             parameter.zero_()
     cameras = make_cameras()
-    kept = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
-    save_model(model, path, provenance=kept)
+    provenance = {"cameras": provenance_cameras(cameras), "viewpoint": Viewpoint.from_cameras(cameras).to_json()}
+    save_model(model, path, provenance=provenance)
 
 
 def make_cameras() -> list[Camera]:
@@ -94,13 +94,13 @@ def make_cameras() -> list[Camera]:
     cameras = []
     for number in range(CAMERAS):
         angle, height = 2 * np.pi * number / CAMERAS, (2.0, 4.0, 6.5)[number % 3]
-        place = np.array((8 * np.cos(angle), 8 * np.sin(angle), height))
-        pose = look_at(place, np.array((0.0, 0.0, 0.7)), np.array((0.0, 0.0, 1.0)))
+        position = np.array((8 * np.cos(angle), 8 * np.sin(angle), height))
+        pose = look_at(position, np.array((0.0, 0.0, 0.7)), np.array((0.0, 0.0, 1.0)))
         cameras.append(Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose))
     return cameras
 
 
-def surface_distances(points: np.ndarray) -> np.ndarray:
+def measure_surface_distances(points: np.ndarray) -> np.ndarray:
     """Return the distances (N,) of points (N, 3) to the nearest ball or the disk."""
     to_balls = np.abs(np.linalg.norm(points[:, None] - BALL_CENTERS, axis=2) - BALL_RADIUS).min(1)
     beyond_edge = np.maximum(np.linalg.norm(points[:, :2], axis=1) - DISK_RADIUS, 0)
@@ -118,11 +118,11 @@ def measure(model: Path, target: Path) -> list[str]:
         return ["failed", f"{wall:.0f} s", "", f"{usage.ru_maxrss * 1024 / 1e9:.2f} GB", ""]
     mesh = trimesh.load(target, process=False)
     vertices = np.asarray(mesh.vertices)
-    errors = 100 / BALL_RADIUS * surface_distances(vertices)
+    errors = 100 / BALL_RADIUS * measure_surface_distances(vertices)
     cpu = usage.ru_utime + usage.ru_stime
     memory = f"{usage.ru_maxrss * 1024 / 1e9:.2f} GB"
-    found = f"{np.median(errors):.2f}, {np.quantile(errors, 0.95):.2f} %"
-    return [f"{len(mesh.faces):,}", f"{wall:.0f} s", f"{cpu:.0f} s", memory, found]
+    error_text = f"{np.median(errors):.2f}, {np.quantile(errors, 0.95):.2f} %"
+    return [f"{len(mesh.faces):,}", f"{wall:.0f} s", f"{cpu:.0f} s", memory, error_text]
 
 
 if __name__ == "__main__":

@@ -57,7 +57,8 @@ def plant_floaters(
     halves = [generator.choice(half, min(count // 2, len(half)), replace=False) for half in usable_halves]
     chosen = torch.from_numpy(np.concatenate(halves))
     parts = zip(_parameters(model), _parameters(candidates), strict=True)
-    planted = _with_gaussians(model, [torch.cat((old, new[chosen])) for old, new in parts])
+    joined = [torch.cat((model_values, candidate_values[chosen])) for model_values, candidate_values in parts]
+    planted = _with_gaussians(model, joined)
     return planted, np.arange(len(planted)) >= len(model)
 
 
@@ -116,17 +117,17 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     rows = []
-    for name, run, scene in load_runs(arguments.runs, arguments.data, arguments.sets):
-        model = hyrfpack.load_model(run).requires_grad_(False)
+    for name, model_file, scene in load_runs(arguments.runs, arguments.data, arguments.sets):
+        model = hyrfpack.load_model(model_file).requires_grad_(False)
         cameras = [view.camera for view in scene.train]
         psnr = hyrfpack.evaluate_model(_with_gaussians(model, _parameters(model)), scene.test).psnr
         for share in arguments.shares:
             planted, is_planted = plant_floaters(model, cameras, share, arguments.seed)
             removed = find_floaters(planted, scene.train, arguments.min_opacity_share)
-            kept = planted.subset(torch.from_numpy(np.flatnonzero(~removed)))
-            hits = int((removed & is_planted).sum())
-            scores = [hyrfpack.evaluate_model(each, scene.test).psnr for each in (planted, kept)]
-            ratios = [hits / max(1, int(total)) for total in (is_planted.sum(), removed.sum())]
+            cleaned = planted.subset(torch.from_numpy(np.flatnonzero(~removed)))
+            hit_count = int((removed & is_planted).sum())
+            scores = [hyrfpack.evaluate_model(scored_model, scene.test).psnr for scored_model in (planted, cleaned)]
+            ratios = [hit_count / max(1, int(total)) for total in (is_planted.sum(), removed.sum())]
             ratio_cells = [f"{ratio:.3f}" if share else "" for ratio in ratios]
             counts = [f"{int(mask.sum()):,}" for mask in (is_planted, removed)]
             row = [name, f"{len(model):,}", *counts, *ratio_cells, *(f"{score:.2f}" for score in (psnr, *scores))]

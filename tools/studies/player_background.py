@@ -45,8 +45,8 @@ def measure_model(browser: Chromium, page: Path, repeats: int) -> list[str]:
     browser.evaluate("new Promise((resolve) => setTimeout(resolve, 3000))")  # work that is done ahead ends meanwhile
     times = browser.evaluate(TIMING_SCRIPT % repeats)
     strides = [min(stride for stride, _ in times), max(stride for stride, _ in times)]
-    each, nodes = (statistics.median(ms for stride, ms in times if stride == wanted) for wanted in strides)
-    return [str(strides[1]), f"{each:,.0f}", f"{nodes:,.0f}", f"{each / nodes:.1f}"]
+    full_ms, stride_ms = (statistics.median(ms for stride, ms in times if stride == compared) for compared in strides)
+    return [str(strides[1]), f"{full_ms:,.0f}", f"{stride_ms:,.0f}", f"{full_ms / stride_ms:.1f}"]
 
 
 def main() -> None:

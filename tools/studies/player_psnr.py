@@ -33,7 +33,7 @@ from tools.studies.web_player import (
     open_page,
     psnr,
     read_from_page,
-    stored_cameras,
+    read_stored_cameras,
 )
 from tools.tables import print_measured_table
 
@@ -93,7 +93,7 @@ def draw_moving(browser: Browser, camera: Camera, factor: int) -> np.ndarray:
 
 def measure_page(browser: Browser, model: Path, views: int, factor: int, enlarge: int) -> list[str]:
     """Return the row of a model whose page is open."""
-    cameras = [cut_camera(enlarge_camera(camera, enlarge), factor) for camera in stored_cameras(model, views)]
+    cameras = [cut_camera(enlarge_camera(camera, enlarge), factor) for camera in read_stored_cameras(model, views)]
     field = hyrfpack.load_merged_model(model)
     exact = render_exact(field, cameras)
     still = [psnr(draw_in_page(browser, camera), picture) for camera, picture in zip(cameras, exact, strict=True)]

@@ -131,8 +131,13 @@ def main() -> None:
             key = f"{name}, {row}, {args.steps}"
             if scores.get(key, {}).get("origin") != origin:
                 model, seconds = train_row(scene, TrainConfig(steps=args.steps), row)
-                found = evaluate_model(model, scene.test)
-                scores[key] = {"psnr": found.psnr, "ssim": found.ssim, "gaussians": len(model), "seconds": seconds}
+                evaluation = evaluate_model(model, scene.test)
+                scores[key] = {
+                    "psnr": evaluation.psnr,
+                    "ssim": evaluation.ssim,
+                    "gaussians": len(model),
+                    "seconds": seconds,
+                }
                 scores[key]["origin"] = origin
                 args.out.mkdir(parents=True, exist_ok=True)
                 scores_file.write_text(json.dumps(scores, indent=1))

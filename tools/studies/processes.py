@@ -64,7 +64,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     rows = []
     for name in options.sets:
-        runs = {
+        results_by_count = {
             count: train(
                 options.data / name,
                 options.out / f"{name}-{options.steps}-{options.seed}-{count}",
@@ -74,7 +74,10 @@ def main(arguments: list[str] | None = None) -> None:
             for count in options.processes
         }
         first = options.processes[0]
-        rows += [format_row(name, count, metrics, first, runs[first]) for count, metrics in runs.items()]
+        rows += [
+            format_row(name, count, metrics, first, results_by_count[first])
+            for count, metrics in results_by_count.items()
+        ]
         print(" | ".join(rows[-1]), file=sys.stderr)
     header = ["set", "processes", "Gaussians", "PSNR", "SSIM", "seconds", "waiting for others", "parallel efficiency"]
     print(markdown_table(header, rows))

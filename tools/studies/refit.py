@@ -61,15 +61,16 @@ def plant_damage(model: HybridModel, is_selected: np.ndarray, kind: str, radius:
         seed: random seed.
     """
     damaged, generator = copy.deepcopy(model), np.random.default_rng(seed)
-    places = torch.from_numpy(np.flatnonzero(is_selected))
+    selected_index = torch.from_numpy(np.flatnonzero(is_selected))
     with torch.no_grad():
         for name in SHUFFLED_NAMES[kind]:
             values = getattr(damaged.gaussians, name)
-            values[places] = values[places[torch.from_numpy(generator.permutation(len(places)))]]
+            shuffled = selected_index[torch.from_numpy(generator.permutation(len(selected_index)))]
+            values[selected_index] = values[shuffled]
         if kind == "moved":
             size = MOVE_PER_RADIUS * radius / model.config.frame.scale
-            moves = torch.from_numpy(generator.normal(0, size, (len(places), 3))).float()
-            damaged.gaussians.positions[places] += moves
+            moves = torch.from_numpy(generator.normal(0, size, (len(selected_index), 3))).float()
+            damaged.gaussians.positions[selected_index] += moves
     return damaged
 
 
@@ -89,12 +90,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     rows = []
-    for name, run, scene in load_runs(arguments.runs, arguments.data, arguments.sets):
-        model = hyrfpack.load_model(run).requires_grad_(False)
+    for name, model_file, scene in load_runs(arguments.runs, arguments.data, arguments.sets):
+        model = hyrfpack.load_model(model_file).requires_grad_(False)
         validation = scene.train[::VALIDATION_INTERVAL]
         scored = scene.test if arguments.held_out else validation
         trained = [view for view in scene.train if arguments.held_out or view not in validation]
-        is_selected, radius = select_region(model, Capture(hyrfpack.describe_file(run)).viewpoint.center)
+        is_selected, radius = select_region(model, Capture(hyrfpack.describe_file(model_file)).viewpoint.center)
         for kind in arguments.kinds:
             damaged = plant_damage(model, is_selected, kind, radius, arguments.seed)
             for steps in arguments.steps:

@@ -49,9 +49,9 @@ def load_variant(data: Path, name: str) -> Scene:
 def keep_few_photos(scene: Scene, count: int) -> Scene:
     """Return the scene with `count` of its training photos, evenly spread."""
     train = evenly_spaced(scene.train, count)
-    kept = {view.name for view in (*train, *scene.test)}
+    kept_names = {view.name for view in (*train, *scene.test)}
     return replace(
-        scene, train=train, tracks={name: rows for name, rows in scene.tracks.items() if name in kept}
+        scene, train=train, tracks={name: rows for name, rows in scene.tracks.items() if name in kept_names}
     )  # fmt: skip
 
 

@@ -62,7 +62,7 @@ def measure_steps(scene: Scene, model: HybridModel, steps: int) -> dict:
     config = TrainConfig(
         steps=steps, resolution_schedule=False, max_gaussians=len(model), density=density, exposure=False
     )
-    before = peak_memory() or 0
+    initial_peak = peak_memory() or 0
     trainer = Trainer(scene, config, model=model)
     is_round = [trainer.strategy.acting(step) for step in range(1, steps + 1)]
     ends = [time.perf_counter()]
@@ -74,7 +74,7 @@ def measure_steps(scene: Scene, model: HybridModel, steps: int) -> dict:
         "step": statistics.median(seconds[2:]),  # the first steps compile kernels
         "round": float(seconds[is_round].max()),
         "peak": peak,
-        "added": peak - before,
+        "added": peak - initial_peak,
         "parts": parts,
     }
 

@@ -216,8 +216,8 @@ class StepRecorder:
         self._results["composite"], self._results["loss"] = [image], [loss]
         seen: set[Any] = set()
         for operation, tensors in self._results.items():
-            for node in new_nodes(tensors, seen):
-                row = backward_row(operation, node.name())
+            for node in iterate_new_nodes(tensors, seen):
+                row = find_backward_row(operation, node.name())
                 if row is not None:
                     node.register_prehook(self._start_node)
                     node.register_hook(self._node_end(row))
@@ -239,18 +239,18 @@ class StepRecorder:
         return self._run_blend_backward(tiles, blended, *args)
 
 
-def new_nodes(tensors: Iterable[Tensor], seen: set[Any]) -> Iterator[Any]:
-    """Yield the nodes of the autograd graph behind the tensors that are not in `seen`, and add them to it."""
+def iterate_new_nodes(tensors: Iterable[Tensor], visited: set[Any]) -> Iterator[Any]:
+    """Yield the nodes of the autograd graph behind the tensors that are not in `visited`, and add them to it."""
     pending = [tensor.grad_fn for tensor in tensors]
     while pending:
         node = pending.pop()
-        if node is not None and node not in seen:
-            seen.add(node)
+        if node is not None and node not in visited:
+            visited.add(node)
             pending.extend(parent for parent, _ in node.next_functions)
             yield node
 
 
-def backward_row(operation: str, node: str) -> str | None:
+def find_backward_row(operation: str, node: str) -> str | None:
     """Return the row of a node of the graph, or None if it has none.
 
     The rasteriser's node is timed inside. A node that accumulates a parameter's gradient counts as autograd, because a
@@ -410,13 +410,13 @@ def measure_core_rates() -> Rates:
 def describe(profile: StepProfile, cameras: Sequence[Camera], rates: Rates) -> str:
     """Return the line above the table: sizes of photos and of the step, threads and measured rates."""
     largest = max(cameras, key=lambda camera: camera.width * camera.height)
-    same = len({(camera.width, camera.height) for camera in cameras}) == 1
+    have_same_size = len({(camera.width, camera.height) for camera in cameras}) == 1
 
     def median(name: str) -> int:
         return round(statistics.median(getattr(view, name) for view in profile.views))
 
     parts = [
-        f"photos of {'' if same else 'up to '}{largest.width:,} x {largest.height:,}",
+        f"photos of {'' if have_same_size else 'up to '}{largest.width:,} x {largest.height:,}",
         f"{profile.model.gaussians:,} Gaussians",
         f"{median('in_view'):,} in view and {median('drawn'):,} visible",
         f"{median('pairs'):,} pairs",

@@ -36,7 +36,7 @@ from tools.browser.chromium import Chromium
 from tools.command import run_command
 from tools.studies.large_model import COUNT_TEXTURES_SCRIPT
 from tools.studies.scene_page import serve_scene
-from tools.studies.web_player import PAGE_TIMEOUT_SECONDS, stored_cameras
+from tools.studies.web_player import PAGE_TIMEOUT_SECONDS, read_stored_cameras
 from tools.tables import markdown_table
 
 WINDOW_SIZE = (640, 400)
@@ -81,8 +81,8 @@ def list_stops(folder: Path, count: int) -> list[Camera]:
     cameras = evenly_spaced([camera_from_numbers(numbers) for numbers in scene.manifest.cameras], count)
     centers = [np.array(fields.config.frame.center) for fields in scene.fields]
     stops = []
-    for place, camera in enumerate(cameras):
-        offset = centers[place * len(centers) // len(cameras)] - centers[0]
+    for number, camera in enumerate(cameras):
+        offset = centers[number * len(centers) // len(cameras)] - centers[0]
         pose = camera.camera_from_world.copy()
         pose[:3, 3] -= pose[:3, :3] @ offset
         stops.append(replace(camera, camera_from_world=pose))
@@ -115,17 +115,17 @@ def walk(address: str, stops: Sequence[Camera], rest_seconds: float) -> Walk:
         return Walk(seconds, record, state, rest_psnrs, browser.evaluate("countTextureBytes()"), browser_bytes)
 
 
-def make_row(name: str, gaussians: int, file_bytes: int | None, found: Walk) -> list[str]:
+def make_row(name: str, gaussians: int, file_bytes: int | None, result: Walk) -> list[str]:
     """Return the row of the table of a walk; `file_bytes` are those of a page that is not streamed."""
-    if found.state is None:
+    if result.state is None:
         cells = [f"{file_bytes:,}", f"{file_bytes:,}", f"{gaussians:,}", f"{gaussians:,}", ""]
     else:
-        counts = (found.record["firstBytes"], found.state["bytes"], found.record["drawn"], found.record["resident"])
-        cells = [*(f"{count:,}" for count in counts), f"{np.mean(found.rest_psnrs):.1f}"]
-    memory = (found.texture_bytes, found.browser_bytes)
-    frame_ms = np.median(found.record["frames"])
+        counts = (result.record["firstBytes"], result.state["bytes"], result.record["drawn"], result.record["resident"])
+        cells = [*(f"{count:,}" for count in counts), f"{np.mean(result.rest_psnrs):.1f}"]
+    memory = (result.texture_bytes, result.browser_bytes)
+    frame_ms = np.median(result.record["frames"])
     megabytes = [f"{size / 1e6:.0f}" for size in memory]
-    return [name, f"{gaussians:,}", f"{found.seconds:.1f}", *cells, f"{frame_ms:.0f}", *megabytes]
+    return [name, f"{gaussians:,}", f"{result.seconds:.1f}", *cells, f"{frame_ms:.0f}", *megabytes]
 
 
 def main() -> None:
@@ -140,15 +140,15 @@ def main() -> None:
     for folder in arguments.folders:
         stops, count = list_stops(folder, arguments.stops), hyrfpack.SceneFolder(folder).manifest.gaussians
         with serve_scene(folder, arguments.budget) as address:
-            found = walk(address, stops, arguments.rest)
-        rows.append(make_row(folder.name, count, None, found))
+            result = walk(address, stops, arguments.rest)
+        rows.append(make_row(folder.name, count, None, result))
         print(rows[-1], flush=True)
     for file in arguments.unsplit:
         with tempfile.TemporaryDirectory() as temporary:
             page = Path(temporary, "page.html")
             hyrfpack.export_model(file, page)
-            found = walk(page.as_uri(), stored_cameras(file, arguments.stops), arguments.rest)
-            rows.append(make_row(file.name, len(hyrfpack.load_merged_model(file)), page.stat().st_size, found))
+            result = walk(page.as_uri(), read_stored_cameras(file, arguments.stops), arguments.rest)
+            rows.append(make_row(file.name, len(hyrfpack.load_merged_model(file)), page.stat().st_size, result))
         print(rows[-1], flush=True)
     print(markdown_table(TABLE_COLUMNS, rows))
 

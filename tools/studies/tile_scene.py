@@ -34,8 +34,8 @@ from tools.command import run_command
 def list_offsets(copies: int, first: np.ndarray, second: np.ndarray) -> list[np.ndarray]:
     """Return the places of a square grid that are nearest to the first one; `first` and `second` are its sides."""
     side = math.ceil(math.sqrt(copies))
-    places = sorted(((row, column) for row in range(side) for column in range(side)), key=lambda place: sum(place))
-    return [row * first + column * second for row, column in places[:copies]]
+    cells = sorted(((row, column) for row in range(side) for column in range(side)), key=lambda cell: sum(cell))
+    return [row * first + column * second for row, column in cells[:copies]]
 
 
 def move_file(container: Container, placement: Placement, shared: Container | None, shared_name: str) -> bytes:

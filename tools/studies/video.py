@@ -181,9 +181,9 @@ def compare_training(photos: Path, video: Path, out: Path, steps: int, photo_by_
     for kind, source in (("photos", photos), ("video", video)):
         hyrfpack.estimate_poses(source, out / kind / "scene", overwrite=True)
         scenes[kind] = hyrfpack.load_scene(out / kind / "scene")
-    shown = {"photos": find_photos(scenes["photos"]), "video": find_photos(scenes["video"], photo_by_frame)}
-    held_out = sorted(set(shown["photos"].values()) & set(shown["video"].values()))[::HELD_OUT_EVERY]
-    split = {kind: hold_out(scene, shown[kind], held_out) for kind, scene in scenes.items()}
+    photos_by_kind = {"photos": find_photos(scenes["photos"]), "video": find_photos(scenes["video"], photo_by_frame)}
+    held_out = sorted(set(photos_by_kind["photos"].values()) & set(photos_by_kind["video"].values()))[::HELD_OUT_EVERY]
+    split = {kind: hold_out(scene, photos_by_kind[kind], held_out) for kind, scene in scenes.items()}
     test = [_replace_by_photo(view, photo_by_frame[_frame_number(view)]) for view in split["video"].test]
     split["video"] = dataclasses.replace(split["video"], test=test)
     given, chosen = (train_and_score(scene, out / kind, steps) for kind, scene in split.items())

@@ -352,12 +352,12 @@ def measure_frame_cpu_ms(browser: Chromium) -> float:
     """Return the CPU milliseconds of the browser for each frame that is drawn while a mouse orbits."""
     x, y = WINDOW_SIZE[0] / 2, WINDOW_SIZE[1] / 2
     browser.button_down(x, y)
-    drawn, cpu, started, step = browser.evaluate("drawnFrames"), browser.cpu_seconds(), time.perf_counter(), 0
+    first_frame, cpu, started, step = browser.evaluate("drawnFrames"), browser.cpu_seconds(), time.perf_counter(), 0
     while time.perf_counter() < started + ORBIT_SECONDS:
         step += 1
         browser.move(x + 3 * (step % 60), y)
         time.sleep(0.02)
-    frames, cpu = browser.evaluate("drawnFrames") - drawn, browser.cpu_seconds() - cpu
+    frames, cpu = browser.evaluate("drawnFrames") - first_frame, browser.cpu_seconds() - cpu
     browser.button_up(x, y)
     return 1000 * cpu / max(1, frames)
 

@@ -47,7 +47,7 @@ def psnr(first: np.ndarray, second: np.ndarray) -> float:
     return psnr_from_mse(float(np.mean((first - second) ** 2)))
 
 
-def stored_cameras(model: Path, count: int) -> list[Camera]:
+def read_stored_cameras(model: Path, count: int) -> list[Camera]:
     """Return at most `count` evenly spaced cameras of those that a model stores."""
     return evenly_spaced(Capture(hyrfpack.describe_file(model)).cameras, count)
 
@@ -95,7 +95,9 @@ def measure_pictures(run: Path, data: Path, folder: Path) -> list[str]:
             open_page(browser, page)
             pictures_by_source[name] = [draw_in_page(browser, view.camera) for view in views]
     for name, pictures in pictures_by_source.items():
-        scores[name] = [psnr(picture, own) for picture, own in zip(pictures, model_pictures, strict=True)]
+        scores[name] = [
+            psnr(picture, model_picture) for picture, model_picture in zip(pictures, model_pictures, strict=True)
+        ]
         scores[f"{name} photos"] = [psnr(picture, photo) for picture, photo in zip(pictures, photos, strict=True)]
     for name, page in page_paths.items():
         psnr_to_model = scores[name]
@@ -114,12 +116,12 @@ def measure_frame_ms(browser: Browser) -> float:
     browser.evaluate("document.getElementById('automatic').checked && document.getElementById('automatic').click()")
     x, y = WINDOW_SIZE[0] / 2, WINDOW_SIZE[1] / 2
     browser.button_down(x, y)
-    drawn, started, step = browser.evaluate("hyrfpack.frames()"), time.perf_counter(), 0
+    first_frame, started, step = browser.evaluate("hyrfpack.frames()"), time.perf_counter(), 0
     while time.perf_counter() < started + ORBIT_SECONDS:
         step += 1
         browser.move(x + 3 * (step % 60), y)
         time.sleep(0.02)
-    frames, seconds = browser.evaluate("hyrfpack.frames()") - drawn, time.perf_counter() - started
+    frames, seconds = browser.evaluate("hyrfpack.frames()") - first_frame, time.perf_counter() - started
     browser.button_up(x, y)
     return 1000 * seconds / max(1, frames)
 

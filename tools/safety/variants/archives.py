@@ -76,10 +76,10 @@ def _use_backslashes(archive: Path) -> None:
 def _set_encrypted_flags(archive: Path) -> None:
     """Set the flags of encryption; the reader refuses the archive before it reads the contents."""
     content = bytearray(archive.read_bytes())
-    for found in re.finditer(rb"PK\x03\x04", bytes(content)):
-        content[found.start() + 6] |= 1
-    for found in re.finditer(rb"PK\x01\x02", bytes(content)):
-        content[found.start() + 8] |= 1
+    for match in re.finditer(rb"PK\x03\x04", bytes(content)):
+        content[match.start() + 6] |= 1
+    for match in re.finditer(rb"PK\x01\x02", bytes(content)):
+        content[match.start() + 8] |= 1
     archive.write_bytes(bytes(content))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from PIL import Image
 
-from hyrfpack.scene import Scene, View, evenly_spaced
+from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 
 COMPARED_PHOTOS = 4
 # Re-encoded and shrunk photos are well above this PSNR to the original picture, and neighbouring photos far below.
@@ -45,22 +45,27 @@ def _pose_key(view: View) -> bytes:
 
 
 def _find_picture_difference(view: View, original: View, masked: float | None) -> str:
-    made, own = view.load(), original.load()
-    size = made.rgb.shape[1::-1]
-    shown = [np.asarray(Image.fromarray(picture.rgb).resize(size), float) for picture in (made, own)]
-    weight = np.ones(shown[0].shape[:2])
-    for picture in (made, own):
-        if picture.mask is not None:
-            weight *= np.asarray(Image.fromarray(picture.mask).resize(size), float)
-        if picture.alpha is not None:
-            weight *= np.asarray(Image.fromarray(picture.alpha).resize(size)) > 200
-    error = ((shown[0] - shown[1]) ** 2).mean(2)
+    picture, original_picture = view.load(), original.load()
+    size = picture.rgb.shape[1::-1]
+    colors = picture.rgb, original_picture.rgb
+    resized = [np.asarray(Image.fromarray(rgb).resize(size), float) for rgb in colors]
+    weight = np.ones(resized[0].shape[:2])
+    for compared in (picture, original_picture):
+        if compared.mask is not None:
+            weight *= np.asarray(Image.fromarray(compared.mask).resize(size), float)
+        if compared.alpha is not None:
+            weight *= np.asarray(Image.fromarray(compared.alpha).resize(size)) > 200
+    error = ((resized[0] - resized[1]) ** 2).mean(2)
     psnr = 10 * np.log10(255**2 / max((error * weight).sum() / max(weight.sum(), 1), 1e-9))
     if psnr < MIN_PSNR_DB:
         return f"{view.name} is a different picture ({psnr:.1f} dB)"
     if masked is not None:
-        masked_rows = np.zeros(made.rgb.shape[0], bool) if made.mask is None else ~made.mask.any(1)
-        original_masked_rows = np.zeros(own.rgb.shape[0], bool) if own.mask is None else ~own.mask.any(1)
-        if abs(masked_rows.mean() - max(masked, original_masked_rows.mean())) > 0.05:
-            return f"{view.name}: {masked_rows.mean():.0%} of its rows are masked instead of {masked:.0%}"
+        share, original_share = _masked_row_share(picture), _masked_row_share(original_picture)
+        if abs(share - max(masked, original_share)) > 0.05:
+            return f"{view.name}: {share:.0%} of its rows are masked instead of {masked:.0%}"
     return ""
+
+
+def _masked_row_share(picture: Picture) -> float:
+    """Return the share of a picture's rows in which all pixels are masked."""
+    return 0.0 if picture.mask is None else float((~picture.mask.any(1)).mean())

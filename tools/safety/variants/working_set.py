@@ -85,8 +85,8 @@ class WorkingSet:
     def write_model(self, model=None, *, text: bool = False) -> None:
         """Write the COLMAP model as text or binary, without the tables that older versions lack."""
         model = model or self.reconstruction()
-        for old in self.model.iterdir():
-            old.unlink()
+        for file in self.model.iterdir():
+            file.unlink()
         (model.write_text if text else model.write_binary)(str(self.model))
         for table in ("rigs", "frames"):
             (self.model / f"{table}{'.txt' if text else '.bin'}").unlink(missing_ok=True)
