@@ -15,7 +15,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.format.arrays import read_config
 from hyrfpack.format.container import Container
 from hyrfpack.format.metadata import read_metadata
-from hyrfpack.format.part_names import open_parts, printable_name
+from hyrfpack.format.part_names import clean_part_name, open_parts
 from hyrfpack.format.parts import write_parts
 from hyrfpack.format.rewrite import with_metadata
 from hyrfpack.format.run_folder import find_model, name_model
@@ -193,6 +193,6 @@ def _move_bytes(part: Container, placement: Placement) -> bytes:
 
 def _free_name(name: str, taken: set[str]) -> str:
     """Return a name that is not taken: "chair", "chair 2", ..."""
-    base = printable_name(name)
+    base = clean_part_name(name)
     names = [base, *(f"{base} {number}" for number in range(2, MAX_PARTS + 1))]
     return next(free for free in names if free not in taken)

@@ -32,7 +32,7 @@ from hyrfpack.export.source import Source
 from hyrfpack.format import describe_file
 from hyrfpack.format.input_folder import find_input_folder
 from hyrfpack.format.run_folder import name_model
-from hyrfpack.format.scene_folder import SceneFolder, is_scene, single_file
+from hyrfpack.format.scene_folder import SceneFolder, as_single_file, is_scene
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel
@@ -107,7 +107,7 @@ def export_player(
         if source is not None:
             suggest_compression(source)
         with ExitStack() as open_resources:
-            file = None if source is None else open_resources.enter_context(single_file(source))
+            file = None if source is None else open_resources.enter_context(as_single_file(source))
             output = open_resources.enter_context(IndexedFolder(Path(folder), INDEX_NAME, overwrite))
             return _write_player(file, output, data, title, credit, editable)
 
@@ -209,7 +209,7 @@ def export_gallery(
         with ExitStack() as open_resources:
             for source in sources:
                 suggest_compression(source)
-            files = [open_resources.enter_context(single_file(source)) for source in sources]
+            files = [open_resources.enter_context(as_single_file(source)) for source in sources]
             output = open_resources.enter_context(IndexedFolder(Path(folder), INDEX_NAME, overwrite))
             return _write_gallery(sources, files, output, scenes, title, credit, editable)
 

@@ -45,7 +45,7 @@ from hyrfpack.export.streamed_sog import write_streamed_sog
 from hyrfpack.export.tiles import write_tiles
 from hyrfpack.format import describe_file, find_model
 from hyrfpack.format.input_folder import find_input_folder
-from hyrfpack.format.scene_folder import SceneFolder, single_file
+from hyrfpack.format.scene_folder import SceneFolder, as_single_file
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
@@ -128,7 +128,7 @@ def export_model(
         suggest_compression(source)
     scene = open_levels(source) if kind in LEVEL_FOLDERS else None
     model = find_model(source)
-    with single_file(model) as file:
+    with as_single_file(model) as file:
         return _export_file(model, file, scene, target, kind, config, data, overwrite, context)
 
 

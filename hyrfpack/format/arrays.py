@@ -30,7 +30,7 @@ MODEL_RULES = {
 }
 
 
-def _decoder_parameters(field: str) -> tuple[str, ...]:
+def _decoder_parameter_names(field: str) -> tuple[str, ...]:
     """Return the names of a decoder's parameters in file order: weights and biases of each layer."""
     return tuple(f"{field}.{kind}.{layer}" for layer in range(3) for kind in ("weights", "biases"))
 
@@ -44,9 +44,9 @@ SECTION_PARAMETERS = {
     sections.SHAPES: ("gaussians.shape_residuals",),
     sections.HARMONICS: ("gaussians.color_residuals",),
     sections.GEOMETRY_TABLE: ("geometry.grid.table",),
-    sections.GEOMETRY_DECODER: _decoder_parameters("geometry"),
+    sections.GEOMETRY_DECODER: _decoder_parameter_names("geometry"),
     sections.RADIANCE_TABLE: ("radiance.grid.table",),
-    sections.RADIANCE_DECODER: _decoder_parameters("radiance"),
+    sections.RADIANCE_DECODER: _decoder_parameter_names("radiance"),
 }
 
 
@@ -65,10 +65,10 @@ def to_arrays(model: HybridModel) -> dict[str, np.ndarray]:
             continue
         parts = [state[name].cpu().numpy().astype(np.float32) for name in names]
         values = parts[0] if len(parts) == 1 else np.concatenate([part.ravel() for part in parts])[:, None]
-        if wrong := int(np.count_nonzero(~np.isfinite(values))):
+        if nonfinite_count := int(np.count_nonzero(~np.isfinite(values))):
             raise HyrfError(
-                f"{wrong} of {values.size} numbers in the model's {sections.SECTION_CONTENTS[group]} are NaN or "
-                "infinite",
+                f"{nonfinite_count} of {values.size} numbers in the model's {sections.SECTION_CONTENTS[group]} are "
+                "NaN or infinite",
                 fix="train it again from an earlier checkpoint",
             )
         matrices[group] = values

@@ -62,20 +62,27 @@ def encode_model(model: HybridModel, profile: str = "raw", provenance: dict | No
             "profile 'compact' takes numbers that were quantised beforehand",
             fix="save the model with profile 'raw', and compress that file with `hyrfpack.compress_model`",
         )
-    sections, used = PROFILES[profile](model, **settings)
-    counts = [section.raw_length // 12 for section in sections if group_and_layer(section.type)[0] == POSITIONS]
-    layers = counts if len(counts) > 1 else []
+    sections, profile_settings = PROFILES[profile](model, **settings)
+    layer_counts = [section.raw_length // 12 for section in sections if group_and_layer(section.type)[0] == POSITIONS]
+    gaussian_count = sum(layer_counts)
     metadata = Metadata(
-        profile, sum(counts), model.config.to_dict(), MODEL_RULES, used, provenance or {}, layers=layers
+        profile,
+        gaussian_count,
+        model.config.to_dict(),
+        MODEL_RULES,
+        profile_settings,
+        provenance or {},
+        layers=layer_counts if len(layer_counts) > 1 else [],
     )
     if model.exposure is not None:
         sections = [encode_exposure(model.exposure), *sections]
     sections = [metadata.to_section(deflate=profile == "compact"), *sections]
-    stored, raw_length = (sum(sizes) for sizes in zip(*((len(s.data), s.raw_length) for s in sections), strict=True))
-    if raw_length > raw_bytes_limit(stored) or sum(counts) > gaussian_limit(stored):
+    stored_bytes = sum(len(section.data) for section in sections)
+    raw_bytes = sum(section.raw_length for section in sections)
+    if raw_bytes > raw_bytes_limit(stored_bytes) or gaussian_count > gaussian_limit(stored_bytes):
         raise HyrfError(
-            f"{raw_length:,} bytes of almost equal numbers would compress to {stored:,} bytes, a ratio that readers "
-            "refuse",
+            f"{raw_bytes:,} bytes of almost equal numbers would compress to {stored_bytes:,} bytes, a ratio that "
+            "readers refuse",
             fix="use profile 'raw' for this model",
         )
     return write_container(sections, minor=lowest_minor_version(sections, metadata.config))

@@ -221,8 +221,8 @@ class Container:
         return bytes(self._read_at(0, self.length))
 
     @property
-    def fix_of_partial(self) -> str:
-        """Return what to do about a part of a file of which only the whole can be read."""
+    def partial_file_fix(self) -> str:
+        """Return the `fix` of an error about a part of a file that can only be read as a whole."""
         return "leave out `fraction`" if self.stored >= self.length else "copy the whole file again"
 
     def _is_available(self, entry: Entry) -> bool:
@@ -259,22 +259,7 @@ class Container:
         """Check the header; return the version, the verified bytes of the table of contents and its line count."""
         length = self.length
         start = bytes(self._read_at(0, min(length, _TOC_OFFSET)))
-        if not start:
-            raise self._damaged_error("the file is empty")
-        if start[: len(MAGIC)] != MAGIC[: len(start)]:
-            raise HyrfFormatError(
-                f"{self.name}: this is not a .hyrf file",
-                fix="check the path; files that were exported for other programs are not read",
-            )
-        # The version is checked first, because another major version may change the layout of everything after it.
-        if len(start) >= len(MAGIC) + _VERSION_STRUCT.size:
-            major, minor = _VERSION_STRUCT.unpack_from(start, len(MAGIC))
-            if major != MAJOR_VERSION:
-                raise HyrfFormatError(
-                    f"{self.name}: this file has format version {major}.{minor} and this hyrfpack reads version "
-                    f"{MAJOR_VERSION}",
-                    fix="update hyrfpack",
-                )
+        self._check_magic_and_version(start)
         if len(start) < _TOC_OFFSET:
             raise self._damaged_error(f"the file ends after {len(start)} bytes, within its header")
         (checksum,) = _CHECKSUM_STRUCT.unpack_from(start, _HEADER_STRUCT.size)
@@ -321,6 +306,28 @@ class Container:
             raise self._damaged_error("the checksum of the table of contents does not match its bytes")
         return (major, minor), toc, count
 
+    def _check_magic_and_version(self, start: bytes) -> None:
+        """Check the first bytes of a file, which may end within its header.
+
+        The version is checked before the rest of the header, because another major version may change the layout of
+        everything after it.
+        """
+        if not start:
+            raise self._damaged_error("the file is empty")
+        if start[: len(MAGIC)] != MAGIC[: len(start)]:
+            raise HyrfFormatError(
+                f"{self.name}: this is not a .hyrf file",
+                fix="check the path; files that were exported for other programs are not read",
+            )
+        if len(start) >= len(MAGIC) + _VERSION_STRUCT.size:
+            major, minor = _VERSION_STRUCT.unpack_from(start, len(MAGIC))
+            if major != MAJOR_VERSION:
+                raise HyrfFormatError(
+                    f"{self.name}: this file has format version {major}.{minor} and this hyrfpack reads version "
+                    f"{MAJOR_VERSION}",
+                    fix="update hyrfpack",
+                )
+
     def _check_toc(self, toc: bytes | memoryview, count: int) -> dict[str, Entry]:
         """Parse the table of contents; every offset and length in the result lies inside the file."""
         length = self.length
@@ -360,8 +367,8 @@ class Container:
             raise self._damaged_error(f"the sections say they decode to {raw:,} bytes, more than {limit:,}")
         return entries
 
-    def _damaged_error(self, what: str) -> HyrfFormatError:
-        return HyrfFormatError(f"{self.name}: {what}", fix="the file is damaged, copy or write it again")
+    def _damaged_error(self, problem: str) -> HyrfFormatError:
+        return HyrfFormatError(f"{self.name}: {problem}", fix="the file is damaged, copy or write it again")
 
 
 def write_container(sections: Sequence[Section], minor: int) -> bytes:
@@ -391,7 +398,10 @@ def write_container(sections: Sequence[Section], minor: int) -> bytes:
         if not _SECTION_TYPE_PATTERN.fullmatch(section.type):
             raise ValueError(f"section type '{section.type}' is not four letters, digits or underscores")
         if not (0 <= section.codec < 1 << 16 and 0 <= section.raw_length <= MAX_RAW_BYTES):
-            raise ValueError(f"section '{section.type}': codec {section.codec}, raw length {section.raw_length}")
+            raise ValueError(
+                f"section '{section.type}' has codec {section.codec} and decodes to {section.raw_length} bytes; codecs "
+                f"are 0 to 65535, and a section may decode to {MAX_RAW_BYTES} bytes"
+            )
         data = _as_bytes(section.data)
         flags = _REQUIRED_FLAG if section.required else 0
         letters = section.type.encode("ascii")
@@ -446,9 +456,8 @@ def raw_bytes_limit(file_length: int) -> int:
 
 def _as_bytes(data: bytes | memoryview) -> memoryview:
     view = memoryview(data)
-    return (
-        view.cast("B") if view.nbytes else memoryview(b"")
-    )  # because an empty view of several dimensions cannot be cast
+    # An empty view of several dimensions cannot be cast.
+    return view.cast("B") if view.nbytes else memoryview(b"")
 
 
 def _padded_length(length: int) -> int:

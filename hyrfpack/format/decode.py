@@ -31,6 +31,7 @@ from hyrfpack.model.config import ModelConfig
 from hyrfpack.model.hybrid import HybridModel
 from hyrfpack.parallel.pool import run_tasks
 from hyrfpack.quant import DamagedDataError
+from hyrfpack.quant.points import LatticePoints
 
 # Decoders of the codecs that read no other section; `compact` has those that need the positions.
 DECODER_BY_CODEC = {**raw.DECODER_BY_CODEC, **paper.DECODER_BY_CODEC}
@@ -151,7 +152,7 @@ def _incomplete_error(container: Container, tags: Iterable[str]) -> HyrfFormatEr
     """Return the error for a partial file that ends before the last of the sections that decoding needs."""
     length, needed = container.length, max(container.entries[tag].end for tag in tags)
     if not any(group_and_layer(tag)[1] for tag in container.entries):
-        fix = f"the file has no layers, so that only the whole file can be read; {container.fix_of_partial}"
+        fix = f"the file has no layers, so that only the whole file can be read; {container.partial_file_fix}"
     elif container.stored < needed:
         fix = f"read a larger part of the file, at least its first {needed:,} bytes"
     else:
@@ -200,7 +201,8 @@ def _decode_sections(container: Container, layout: ModelLayout) -> dict[str, np.
     config, shapes, name = layout.config, layout.shapes, container.name
     sections = {tag: read_section(container, tag) for tag in shapes}
     arrays: dict[str, np.ndarray] = {}
-    points = {}  # lattice points by layer, if positions are on a lattice; other sections need them for decoding
+    # Lattice points by layer, if positions are on a lattice. Other sections need them for decoding.
+    points: dict[int, LatticePoints] = {}
 
     def decode_positions(layer: int) -> None:
         tag = layer_section(POSITIONS, layer)
@@ -211,10 +213,10 @@ def _decode_sections(container: Container, layout: ModelLayout) -> dict[str, np.
                 )
 
     run_tasks(decode_positions, len(layout.layers))
-    rest = [tag for tag in shapes if tag not in arrays]
+    remaining_tags = [tag for tag in shapes if tag not in arrays]
 
     def decode(index: int) -> None:
-        tag = rest[index]
+        tag = remaining_tags[index]
         group, layer = group_and_layer(tag)
         codec, data = sections[tag].codec, memoryview(sections[tag].data)
         with _add_error_context(name, tag):
@@ -223,16 +225,16 @@ def _decode_sections(container: Container, layout: ModelLayout) -> dict[str, np.
             else:
                 arrays[tag] = compact.decode_section(group, codec, data, shapes[tag], config, points.get(layer))
 
-    run_tasks(decode, len(rest))
+    run_tasks(decode, len(remaining_tags))
     return arrays
 
 
 @contextmanager
-def _add_error_context(name: str, group: str) -> Iterator[None]:
+def _add_error_context(name: str, tag: str) -> Iterator[None]:
     """Add the file and the section to the message of a format error."""
     try:
         yield
     except HyrfFormatError as error:
-        raise error.with_text(f"{name}: section '{group}': {error.problem}") from error
+        raise error.with_text(f"{name}: section '{tag}': {error.problem}") from error
     except DamagedDataError as error:
-        raise HyrfFormatError(f"{name}: section '{group}': {error}", fix="copy or write the file again") from error
+        raise HyrfFormatError(f"{name}: section '{tag}': {error}", fix="copy or write the file again") from error

@@ -20,8 +20,8 @@ def encode_exposure(exposure: ExposureMap) -> Section:
     centers["position"], centers["direction"] = exposure.positions, exposure.directions
     centers["weight"] = exposure.weights
     parts = (exposure.lengths, exposure.box, exposure.mean, exposure.limits, exposure.steps)
-    head = ExposureHeader(len(centers), *(tuple(part.ravel().tolist()) for part in parts))
-    data = head.to_bytes() + centers.tobytes()
+    header = ExposureHeader(len(centers), *(tuple(part.ravel().tolist()) for part in parts))
+    data = header.to_bytes() + centers.tobytes()
     return Section(EXPOSURE, CODEC_EXPOSURE, data, len(data), required=False)
 
 
@@ -34,17 +34,17 @@ def decode_exposure(codec: int, data: memoryview, raw_length: int) -> ExposureMa
         raw_length: bytes that the section declares to decode to.
 
     Raises:
-        HyrfFormatError: numbers are out of range, or as `read_exposure_header`.
+        HyrfFormatError: a number is out of range, or an error of `read_exposure_header`.
     """
-    head, rest = read_exposure_header(codec, data, raw_length)
-    centers = np.frombuffer(rest, _CENTER_DTYPE)
+    header, center_bytes = read_exposure_header(codec, data, raw_length)
+    centers = np.frombuffer(center_bytes, _CENTER_DTYPE)
     try:
         return ExposureMap(
-            box=np.array(head.box, np.float32).reshape(2, 3),
-            lengths=np.array(head.lengths, np.float32),
-            mean=np.array(head.mean, np.float32),
-            limits=np.array(head.limits, np.float32).reshape(2, 3),
-            steps=np.array(head.steps, np.float32),
+            box=np.array(header.box, np.float32).reshape(2, 3),
+            lengths=np.array(header.lengths, np.float32),
+            mean=np.array(header.mean, np.float32),
+            limits=np.array(header.limits, np.float32).reshape(2, 3),
+            steps=np.array(header.steps, np.float32),
             positions=np.ascontiguousarray(centers["position"]),
             directions=np.ascontiguousarray(centers["direction"]),
             weights=np.ascontiguousarray(centers["weight"]).astype(np.int16),

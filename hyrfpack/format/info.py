@@ -143,7 +143,9 @@ def describe_scene(path: str | os.PathLike[str]) -> dict:
     listed = {key: value for key, value in manifest.to_dict().items() if key in keys}
     facts = {**parts[0], **_describe_totals(manifest.total_bytes, manifest.gaussians), "scene": listed}
     if len(parts) > 1:
-        facts["parts"] = [{"name": part.name, **own} for part, own in zip(manifest.parts, parts, strict=True)]
+        facts["parts"] = [
+            {"name": part.name, **facts_of_part} for part, facts_of_part in zip(manifest.parts, parts, strict=True)
+        ]
     return facts
 
 
@@ -175,7 +177,7 @@ def _describe_exposure(container: Container) -> dict | None:
         return None
     section = read_section(container, EXPOSURE)
     try:
-        head, _ = read_exposure_header(section.codec, section.data, section.raw_length)
+        header, _ = read_exposure_header(section.codec, section.data, section.raw_length)
     except HyrfFormatError as error:
         raise error.with_text(f"{container.name}: section '{EXPOSURE}': {error.problem}") from error
-    return {"centers": head.centers, "stops": list(head.stops)}
+    return {"centers": header.centers, "stops": list(header.stops)}

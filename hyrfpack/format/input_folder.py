@@ -1,4 +1,4 @@
-"""The folder of which every file is read together with a model, so that no output may be written into it."""
+"""Finds the folder of a scene, all of whose files are read, so that no output may be written into it."""
 
 from __future__ import annotations
 

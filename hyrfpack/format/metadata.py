@@ -24,6 +24,7 @@ MAX_METADATA_BYTES = 1 << 20
 MAX_DEFLATE_OVERHEAD_BYTES = 1024
 MAX_NESTING_DEPTH = 64  # limits the recursion of functions that walk the objects and lists
 INTEGER_LIMIT = 1 << 63
+MAX_GAUSSIANS = (1 << 40) - 1
 # A file may declare this many Gaussians for each of its bytes, plus a constant, because equal Gaussians take no bytes.
 MAX_GAUSSIANS_PER_FILE_BYTE = 32
 EXTRA_GAUSSIANS_PER_FILE = 1 << 18
@@ -134,6 +135,19 @@ def read_metadata(container: Container) -> Metadata:
 
 
 def _parse_metadata(container: Container) -> Metadata:
+    values = _parse_json_object(_read_json_text(container), container.name)
+    values = {item.name: values.get(item.name, [] if item.name == "layers" else None) for item in fields(Metadata)}
+    try:
+        _check_values(values)
+    except ValueError as error:
+        raise HyrfFormatError(
+            f"{container.name}: the metadata is not valid: {error}", fix="write the file again"
+        ) from error
+    return Metadata(**values)
+
+
+def _read_json_text(container: Container) -> bytes:
+    """Return the JSON text of the metadata, after a check of its sizes."""
     name, entry = container.name, container.entries.get(METADATA)
     if entry is not None and (entry.raw_length > MAX_METADATA_BYTES or entry.codec not in (CODEC_JSON, CODEC_DEFLATED)):
         raise HyrfFormatError(
@@ -149,6 +163,11 @@ def _parse_metadata(container: Container) -> Metadata:
     data = bytes(container[METADATA].data)  # raises HyrfFormatError if the section is absent
     if entry is not None and entry.codec == CODEC_DEFLATED:
         data = _inflate(data, entry.raw_length, name)
+    return data
+
+
+def _parse_json_object(data: bytes, name: str) -> dict[str, Any]:
+    """Parse a JSON object of finite numbers, nested no deeper than MAX_NESTING_DEPTH."""
     try:
         values = json.loads(data.decode("utf-8"), parse_constant=_parse_finite, parse_float=_parse_finite)
     # Deep nesting overflows the parser's stack, and Python converts no integer of 5,000 digits (ValueError).
@@ -164,32 +183,32 @@ def _parse_metadata(container: Container) -> Metadata:
             f"{name}: the metadata is nested deeper than {MAX_NESTING_DEPTH} levels",
             fix="write the file again",
         )
-    values = {"layers": [], **values}
-    values = {item.name: values.get(item.name) for item in fields(Metadata)}
-    try:
-        for key, kind in (("gaussians", int), ("rules", dict), ("settings", dict), ("provenance", dict)):
-            _check_type(values[key], kind, key)
-        _check_type(values["config"], _CONFIG_TYPES, "config")
-        if "rotation" in values["config"]["frame"]:
-            _check_type(values["config"]["frame"]["rotation"], (float,) * 4, "config.frame.rotation")
-        if "residual_degree" in values["config"]:
-            _check_type(values["config"]["residual_degree"], int, "config.residual_degree")
-        _check_type([values["profile"], values["writer"]], (str, str), "profile or writer")
-        if not 0 <= values["gaussians"] < 1 << 40:
-            raise ValueError(f"there cannot be {values['gaussians']} Gaussians")
-        layers = values["layers"]
-        _check_type(layers, list, "layers")
-        if len(layers) > MAX_LAYERS:
-            raise ValueError(f"there are {len(layers)} layers, and there may be {MAX_LAYERS}")
-        _check_type(layers, (int,) * len(layers), "layers")
-        if layers and (min(layers) < 0 or sum(layers) != values["gaussians"]):
-            raise ValueError(f"its layers do not add up to {values['gaussians']} Gaussians")
-    except ValueError as error:
-        raise HyrfFormatError(f"{name}: the metadata is not valid: {error}", fix="write the file again") from error
-    return Metadata(**values)
+    return values
+
+
+def _check_values(values: dict[str, Any]) -> None:
+    """Raise ValueError unless the values of all fields of `Metadata` have the right types and fit each other."""
+    for key, kind in (("gaussians", int), ("rules", dict), ("settings", dict), ("provenance", dict)):
+        _check_type(values[key], kind, key)
+    _check_type(values["config"], _CONFIG_TYPES, "config")
+    if "rotation" in values["config"]["frame"]:
+        _check_type(values["config"]["frame"]["rotation"], (float,) * 4, "config.frame.rotation")
+    if "residual_degree" in values["config"]:
+        _check_type(values["config"]["residual_degree"], int, "config.residual_degree")
+    _check_type([values["profile"], values["writer"]], (str, str), "profile or writer")
+    if not 0 <= values["gaussians"] <= MAX_GAUSSIANS:
+        raise ValueError(f"there cannot be {values['gaussians']} Gaussians")
+    layers = values["layers"]
+    _check_type(layers, list, "layers")
+    if len(layers) > MAX_LAYERS:
+        raise ValueError(f"there are {len(layers)} layers, and there may be {MAX_LAYERS}")
+    _check_type(layers, (int,) * len(layers), "layers")
+    if layers and (min(layers) < 0 or sum(layers) != values["gaussians"]):
+        raise ValueError(f"its layers do not add up to {values['gaussians']} Gaussians")
 
 
 def _is_stored_length_plausible(codec: int, stored: int, raw: int) -> bool:
+    """Return whether JSON text of `raw` bytes may take `stored` bytes in this codec."""
     return stored == raw if codec == CODEC_JSON else stored <= raw + MAX_DEFLATE_OVERHEAD_BYTES
 
 

@@ -14,7 +14,7 @@ from hyrfpack.format.compact.groups import ENTROPY_MODEL_COUNT, GroupSymbols, St
 from hyrfpack.format.compact.plan import Layer, Plan, build_step_groups
 from hyrfpack.format.compact.quantized import LOGIT_COLUMNS, QuantizedModel
 from hyrfpack.format.container import Section, write_container
-from hyrfpack.format.part_names import CODEC_FILE, write_part_names
+from hyrfpack.format.part_names import CODEC_PART_FILE, write_part_names
 from hyrfpack.format.sections import DECODER_SECTIONS, TABLE_SECTIONS, part_section
 from hyrfpack.format.versions import MERGED_MINOR_VERSION
 from hyrfpack.model import ExposureMap, Frame, HashGridConfig, HybridModel, ModelConfig
@@ -67,7 +67,7 @@ def min_merged_file_bytes(parts: Sequence[tuple[str, dict | None, ExposureMap | 
     sections = [write_part_names([name for name, _, _ in parts])]
     for number, (_, provenance, exposure) in enumerate(parts):
         part = bytes(min_file_bytes(provenance, exposure))
-        sections.append(Section(part_section(number), CODEC_FILE, part, len(part)))
+        sections.append(Section(part_section(number), CODEC_PART_FILE, part, len(part)))
     return len(write_container(sections, minor=MERGED_MINOR_VERSION))
 
 
@@ -85,22 +85,25 @@ def check_target_bytes(target_bytes: int, provenance: dict | None = None, exposu
     check_target_above(target_bytes, min_file_bytes(provenance, exposure))
 
 
-def check_target_above(target_bytes: int, smallest: int) -> None:
+def check_target_above(target_bytes: int, min_bytes: int) -> None:
     """Raise an error if a target size is below a lower bound of the size of the file; both are in bytes.
 
     Raises:
         HyrfError: the size is below it. The message suggests a unit if it seems to be missing.
     """
-    if target_bytes >= smallest:
+    if target_bytes >= min_bytes:
         return
-    unit = (
-        "MB" if target_bytes < MEGABYTE_HINT_BELOW_BYTES else "kB" if target_bytes < KILOBYTE_HINT_BELOW_BYTES else None
-    )
-    bound = f"use a larger `target_bytes`; {smallest:,} is a lower bound, which only a model without Gaussians reaches"
-    remedy = f"did you mean {target_bytes}{unit}?" if unit else bound
+    if target_bytes < MEGABYTE_HINT_BELOW_BYTES:
+        fix = f"did you mean {target_bytes}MB?"
+    elif target_bytes < KILOBYTE_HINT_BELOW_BYTES:
+        fix = f"did you mean {target_bytes}kB?"
+    else:
+        fix = (
+            f"use a larger `target_bytes`; {min_bytes:,} is a lower bound, which only a model without Gaussians reaches"
+        )
     raise HyrfError(
-        f"a target size of {target_bytes:,} bytes is below the smallest possible file, about {smallest:,} bytes",
-        fix=remedy,
+        f"a target size of {target_bytes:,} bytes is below the smallest possible file, about {min_bytes:,} bytes",
+        fix=fix,
     )
 
 

@@ -53,7 +53,7 @@ def encode(model: HybridModel, **settings: Any) -> tuple[list[Section], dict]:
         HyrfError: a parameter is NaN or infinite; a position, logit or decoder weight exceeds the range of half
             precision; a setting is out of range; or dahuffman is not installed.
     """
-    chosen = PaperSettings(**settings)
+    paper_settings = PaperSettings(**settings)
     with needs_package("profile 'paper'"):
         import dahuffman  # noqa: F401 - builds the Huffman codes; imported here to fail early if it is missing
     arrays = to_arrays(model)
@@ -67,15 +67,17 @@ def encode(model: HybridModel, **settings: Any) -> tuple[list[Section], dict]:
     arrays[sections.OPACITIES] = _clip_opacity_logits(model, arrays[sections.OPACITIES])
     return [
         halves[sections.POSITIONS],
-        _encode_residual_vq(sections.COLORS, arrays[sections.COLORS], chosen.color, chosen.seed),
-        _encode_residual_vq(sections.SCALES, arrays[sections.SCALES], chosen.scale, chosen.seed),
-        _encode_residual_vq(sections.OPACITIES, arrays[sections.OPACITIES], chosen.opacity, chosen.seed),
+        _encode_residual_vq(sections.COLORS, arrays[sections.COLORS], paper_settings.color, paper_settings.seed),
+        _encode_residual_vq(sections.SCALES, arrays[sections.SCALES], paper_settings.scale, paper_settings.seed),
+        _encode_residual_vq(
+            sections.OPACITIES, arrays[sections.OPACITIES], paper_settings.opacity, paper_settings.seed
+        ),
         _encode_min_max(sections.GEOMETRY_TABLE, arrays[sections.GEOMETRY_TABLE]),
         halves[sections.GEOMETRY_DECODER],
         _encode_min_max(sections.RADIANCE_TABLE, arrays[sections.RADIANCE_TABLE]),
         halves[sections.RADIANCE_DECODER],
         *(halves[group] for group in sections.RESIDUAL_SECTIONS if group in halves),
-    ], asdict(chosen)
+    ], asdict(paper_settings)
 
 
 @torch.no_grad()
@@ -125,9 +127,10 @@ def _decode_min_max(data: memoryview, shape: tuple[int, int]) -> np.ndarray:
     return MinMaxQuantizer.decode(codes, params).reshape(shape)
 
 
-def _encode_residual_vq(tag: str, values: np.ndarray, shape: tuple[int, int], seed: int) -> Section:
+def _encode_residual_vq(tag: str, values: np.ndarray, codebook_counts: tuple[int, int], seed: int) -> Section:
+    """Encode values with `codebook_counts`: the number of stages, and of codewords in each stage."""
     _check_half_range(tag, values)
-    stages, size = shape
+    stages, size = codebook_counts
     quantizer = ResidualVectorQuantizer(stages, size, codebook_dtype="float16", seed=seed)
     indices, codebooks = quantizer.encode(values)
     parts = [_VQ_HEADER_STRUCT.pack(stages, values.shape[1], size), codebooks.astype("<f2").tobytes()]

@@ -12,24 +12,25 @@ from hyrfpack.format.metadata import gaussian_limit, read_metadata
 from hyrfpack.format.sections import MAX_PARTS, PART_NAMES, SECTION_CONTENTS, part_section
 from hyrfpack.format.shared import has_shared_sections
 
-ONE_PART_NAME = "scene"  # of a file that is not merged
-CODEC_NAMES = 0
-CODEC_FILE = 10
-MAX_NAME_LENGTH = 64
-MAX_NAMES_BYTES = 1 << 16
+# The name of the only part of a file that is not merged.
+ONE_PART_NAME = "scene"
+CODEC_PART_NAMES = 0
+CODEC_PART_FILE = 10
+MAX_PART_NAME_LENGTH = 64
+MAX_PART_NAMES_BYTES = 1 << 16
 
 
 def check_part_names(names: Sequence[object]) -> None:
-    """Raise ValueError unless the names of the parts are as a merged file needs them.
+    """Raise ValueError unless a merged file may have parts of these names.
 
-    They must be 1 to MAX_PARTS different texts of 1 to MAX_NAME_LENGTH characters without control characters.
+    They must be 1 to MAX_PARTS different texts of 1 to MAX_PART_NAME_LENGTH characters without control characters.
     """
     if not 1 <= len(names) <= MAX_PARTS:
         raise ValueError(f"there are {len(names)} parts; a file holds 1 to {MAX_PARTS}")
     for name in names:
-        if not isinstance(name, str) or not 1 <= len(name) <= MAX_NAME_LENGTH or has_control_characters(name):
+        if not isinstance(name, str) or not 1 <= len(name) <= MAX_PART_NAME_LENGTH or has_control_characters(name):
             raise ValueError(
-                f"{name!r:.80} is no name of a part, which has 1 to {MAX_NAME_LENGTH} characters, none "
+                f"{name!r:.80} cannot be the name of a part; it must have 1 to {MAX_PART_NAME_LENGTH} characters, none "
                 "of them a control character"
             )
     if len(set(names)) != len(names):
@@ -40,7 +41,7 @@ def write_part_names(names: Sequence[str]) -> Section:
     """Return the section with the names of the parts."""
     check_part_names(names)
     data = json.dumps({"names": list(names)}, separators=(",", ":")).encode("ascii")
-    return Section(PART_NAMES, CODEC_NAMES, data, len(data))
+    return Section(PART_NAMES, CODEC_PART_NAMES, data, len(data))
 
 
 def read_part_names(container: Container) -> list[str]:
@@ -50,13 +51,13 @@ def read_part_names(container: Container) -> list[str]:
         HyrfFormatError: the names are damaged, or a part is missing.
     """
     name, entry = container.name, container.entries[PART_NAMES]
-    if entry.codec != CODEC_NAMES or entry.raw_length != entry.length or entry.length > MAX_NAMES_BYTES:
+    if entry.codec != CODEC_PART_NAMES or entry.raw_length != entry.length or entry.length > MAX_PART_NAMES_BYTES:
         raise HyrfFormatError(f"{name}: the names of its parts cannot be read", fix="update hyrfpack")
     try:
         text = bytes(container[PART_NAMES].data).decode("utf-8")
         names = json.loads(text, parse_constant=reject_constant)["names"]
         if not isinstance(names, list):
-            raise ValueError("the names are no list")
+            raise ValueError("the names are not a list")
         check_part_names(names)
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise HyrfFormatError(
@@ -65,9 +66,9 @@ def read_part_names(container: Container) -> list[str]:
     return names
 
 
-def printable_name(name: str) -> str:
-    """Return a text without control characters, cut to fit into a name of a part with a number after it."""
-    return remove_control_characters(name)[: MAX_NAME_LENGTH - 3] or "part"
+def clean_part_name(name: str) -> str:
+    """Return a valid name of a part: `name` without control characters, short enough for a number after it."""
+    return remove_control_characters(name)[: MAX_PART_NAME_LENGTH - 3] or "part"
 
 
 def reject_constant(name: str) -> None:
@@ -92,12 +93,12 @@ def open_parts(
         raise HyrfFormatError(
             f"{container.name}: a merged file can only be read whole, but only {container.available:,} of its "
             f"{container.length:,} bytes are available or allowed",
-            fix=container.fix_of_partial,
+            fix=container.partial_file_fix,
         )
     parts = []
     for number, part_name in enumerate(read_part_names(container)):
         section = container[part_section(number)]
-        if section.codec != CODEC_FILE or section.raw_length != len(section.data):
+        if section.codec != CODEC_PART_FILE or section.raw_length != len(section.data):
             raise HyrfFormatError(
                 f"{container.name}: section '{section.type}' has the unknown codec {section.codec}, or a wrong size",
                 fix="update hyrfpack",

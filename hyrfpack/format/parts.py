@@ -13,7 +13,7 @@ from hyrfpack.format.container import Container, Section, read_container, write_
 from hyrfpack.format.decode import decode_container
 from hyrfpack.format.info import FileReport, section_sizes
 from hyrfpack.format.metadata import read_metadata
-from hyrfpack.format.part_names import CODEC_FILE, ONE_PART_NAME, open_parts, write_part_names
+from hyrfpack.format.part_names import CODEC_PART_FILE, ONE_PART_NAME, open_parts, write_part_names
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
 from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, PART_NAMES, SECTION_CONTENTS, part_section
 from hyrfpack.format.versions import MERGED_MINOR_VERSION
@@ -25,13 +25,13 @@ def encode_parts(parts: Sequence[tuple[str, bytes]]) -> bytes:
     """Encode a merged file of named parts, each the bytes of a `.hyrf` file of one model. The first is the scene.
 
     Raises:
-        HyrfFormatError: a part is damaged or no file of one model, the parts together exceed the limits of a file, or
-            some of them are antialiased and others are not.
+        HyrfFormatError: a part is damaged or is not a file of one model, the parts together exceed the limits of a
+            file, or some of them are antialiased and others are not.
         ValueError: a name is not valid, or two are equal.
     """
     sections = [write_part_names([name for name, _ in parts])]
     for number, (_, data) in enumerate(parts):
-        sections.append(Section(part_section(number), CODEC_FILE, data, len(data)))
+        sections.append(Section(part_section(number), CODEC_PART_FILE, data, len(data)))
     data = write_container(sections, minor=MERGED_MINOR_VERSION)
     open_parts(read_container(data, SECTION_CONTENTS, "the merged file"), limits_fix="merge fewer models")
     return data
@@ -80,9 +80,7 @@ def load_merged_model(path: str | os.PathLike[str], device: str | torch.device =
     device = choose_device(device)
     model = load_model_or_parts(path)
     merged = model if isinstance(model, MergedModel) else MergedModel((ONE_PART_NAME,), (model,))
-    for part in merged.parts:
-        part.to(device)
-    return merged
+    return merged.to(device)
 
 
 def load_model_or_parts(path: str | os.PathLike[str]) -> HybridModel | MergedModel:

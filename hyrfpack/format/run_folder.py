@@ -98,8 +98,8 @@ def name_model(path: str | os.PathLike[str]) -> str:
 
 def describe_unfinished_run(run: RunStatus) -> str:
     """Return a message clause on the progress of an unfinished run; FINISH_RUN_ADVICE says how to finish it."""
-    done = "" if run.step is None or run.steps is None else f" (step {run.step:,} of {run.steps:,})"
-    return f"the run has not finished{done}"
+    progress = "" if run.step is None or run.steps is None else f" (step {run.step:,} of {run.steps:,})"
+    return f"the run has not finished{progress}"
 
 
 def read_run_status(folder: str | os.PathLike[str]) -> RunStatus:

@@ -38,7 +38,7 @@ _LOG = logging.getLogger(__name__)
 
 StrPath = str | os.PathLike[str]
 
-COPY_AGAIN = "copy the whole folder again, or split the model again"
+COPY_AGAIN_FIX = "copy the whole folder again, or split the model again"
 
 
 def is_scene(path: StrPath) -> bool:
@@ -70,7 +70,7 @@ class _SceneFiles:
             self.path = path.parent if path.name == MANIFEST_NAME and not path.is_dir() else path
         else:
             self.path = path
-            with _naming_errors(path):
+            with _add_path_to_errors(path):
                 self._prefix = _find_prefix(self._archive())
 
     def _archive(self) -> zipfile.ZipFile:
@@ -90,7 +90,7 @@ class _SceneFiles:
 
     def read(self, name: str, limit: int) -> bytes:
         """Return the bytes of a file, at most `limit` and one more; nothing is read of a file that unpacks to more."""
-        with _naming_errors(self.path / name):
+        with _add_path_to_errors(self.path / name):
             if self.is_folder:
                 with open_regular_file(self.path / name) as file:
                     return file.read(limit + 1)
@@ -101,31 +101,31 @@ class _SceneFiles:
                 raise HyrfFormatError(
                     f"{self.path / name}: its {info.compress_size:,} bytes would unpack to {info.file_size:,}, more "
                     f"than {allowed:,}",
-                    fix=COPY_AGAIN,
+                    fix=COPY_AGAIN_FIX,
                 )
             with self._archive().open(info) as member:
                 return member.read(limit + 1)
 
-    def size(self, name: str) -> int:
-        """Return the size of a file."""
-        with _naming_errors(self.path / name):
+    def measure_size(self, name: str) -> int:
+        """Return the size of a file in bytes, unpacked; the file is not read."""
+        with _add_path_to_errors(self.path / name):
             if self.is_folder:
                 return os.stat(self.path / name).st_size
             return self._archive().getinfo(self._prefix + name).file_size
 
 
 @contextmanager
-def _naming_errors(path: Path) -> Iterator[None]:
+def _add_path_to_errors(path: Path) -> Iterator[None]:
     """Turn whatever is raised where a file is opened, read or unpacked into a HyrfFormatError that names the file."""
     try:
         yield
     except (HyrfFormatError, MemoryError):
         raise
     except (FileNotFoundError, KeyError, NotADirectoryError) as error:
-        raise HyrfFormatError(f"{path}: this file of the scene is missing", fix=COPY_AGAIN) from error
+        raise HyrfFormatError(f"{path}: this file of the scene is missing", fix=COPY_AGAIN_FIX) from error
     except Exception as error:  # zipfile and its decompressors raise exceptions of many types
         reason = getattr(error, "strerror", None) or short_reason(error)
-        raise HyrfFormatError(f"{path}: the file cannot be read ({reason})", fix=COPY_AGAIN) from error
+        raise HyrfFormatError(f"{path}: the file cannot be read ({reason})", fix=COPY_AGAIN_FIX) from error
 
 
 class SceneFolder:
@@ -168,11 +168,11 @@ class SceneFolder:
         Raises:
             HyrfFormatError: the file is missing, damaged, or another one than the manifest says.
         """
-        self._check_size(item, self._files.size(item.file))
+        self._check_size(item, self._files.measure_size(item.file))
         name, data = self.path / item.file, self._files.read(item.file, item.bytes)
         self._check_size(item, len(data))
         if f"{zlib.crc32(data):08x}" != item.crc32:
-            raise HyrfFormatError(f"{name}: its bytes are not those that the manifest lists", fix=COPY_AGAIN)
+            raise HyrfFormatError(f"{name}: its bytes are not those that the manifest lists", fix=COPY_AGAIN_FIX)
         return data
 
     def open_file(self, item: SceneFile) -> Container:
@@ -188,18 +188,18 @@ class SceneFolder:
             HyrfFormatError: a file is missing or has another size.
         """
         for item in self.manifest.files:
-            self._check_size(item, self._files.size(item.file))
+            self._check_size(item, self._files.measure_size(item.file))
         listed = {item.file for item in self.manifest.files}
-        extra = sorted({path.name for path in self.path.glob("*.hyrf")} - listed) if self._files.is_folder else []
-        if extra:
-            more = f" and {len(extra) - 1} more" if len(extra) > 1 else ""
-            _LOG.warning(f"{self.path / extra[0]}{more}: not in the manifest and ignored")
+        unlisted = sorted({path.name for path in self.path.glob("*.hyrf")} - listed) if self._files.is_folder else []
+        if unlisted:
+            more = f" and {len(unlisted) - 1} more" if len(unlisted) > 1 else ""
+            _LOG.warning(f"{self.path / unlisted[0]}{more}: not in the manifest and ignored")
 
     def _check_size(self, item: SceneFile, size: int) -> None:
         if size != item.bytes:
             raise HyrfFormatError(
                 f"{self.path / item.file}: the manifest says {item.bytes:,} bytes and there are {size:,}",
-                fix=COPY_AGAIN,
+                fix=COPY_AGAIN_FIX,
             )
 
     def load(
@@ -218,8 +218,8 @@ class SceneFolder:
         from hyrfpack.model.merged import parts_of
 
         device = choose_device(device)
-        chosen = [0] * len(self.manifest.chunks) if levels is None else levels
-        chunks = [None if level is None else self.load_chunk(number, level) for number, level in enumerate(chosen)]
+        levels = [0] * len(self.manifest.chunks) if levels is None else levels
+        chunks = [None if level is None else self.load_chunk(number, level) for number, level in enumerate(levels)]
         model = self.join(chunks)
         for part in parts_of(model):
             # The next call needs the fields as they are, wherever this model moves.
@@ -236,8 +236,8 @@ class SceneFolder:
 
         names = [part.name for part in self.manifest.parts]
         numbers = [chunk.part for chunk in self.manifest.chunks]
-        given = [(chunk, part) for chunk, part in zip(chunks, numbers, strict=True) if chunk is not None]
-        return join_parts(names, self.fields, [chunk for chunk, _ in given], [part for _, part in given])
+        present = [(chunk, part) for chunk, part in zip(chunks, numbers, strict=True) if chunk is not None]
+        return join_parts(names, self.fields, [chunk for chunk, _ in present], [part for _, part in present])
 
     @cached_property
     def _shared_files(self) -> list[Container]:
@@ -255,7 +255,7 @@ class SceneFolder:
             if len(models[-1]):
                 raise HyrfFormatError(
                     f"{self.path / part.file}: it holds Gaussians, and should hold only what chunks share",
-                    fix=COPY_AGAIN,
+                    fix=COPY_AGAIN_FIX,
                 )
         return models
 
@@ -278,7 +278,7 @@ class SceneFolder:
             if name == part.file:
                 return self._shared_files[chunk.part]
             raise HyrfFormatError(
-                f"{self.path / item.file}: it refers to {name}, and the manifest says {part.file}", fix=COPY_AGAIN
+                f"{self.path / item.file}: it refers to {name}, and the manifest says {part.file}", fix=COPY_AGAIN_FIX
             )
 
         with self.open_file(item) as container:
@@ -287,13 +287,13 @@ class SceneFolder:
         if len(model) != item.gaussians:
             raise HyrfFormatError(
                 f"{self.path / item.file}: the manifest says {item.gaussians:,} Gaussians and there are {len(model):,}",
-                fix=COPY_AGAIN,
+                fix=COPY_AGAIN_FIX,
             )
         return model
 
 
 @contextmanager
-def single_file(path: StrPath) -> Iterator[Path]:
+def as_single_file(path: StrPath) -> Iterator[Path]:
     """Yield the path of a model's file: `path` itself, or a temporary file of all chunks of a scene, uncompressed.
 
     The temporary file has the name of the scene, profile "raw" and the scene's finest levels. It is a merged file if

@@ -18,20 +18,22 @@ from hyrfpack.checks import check_text
 from hyrfpack.config.split import MAX_LEVELS, MAX_TITLE_LENGTH
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import MAX_FILE_BYTES
-from hyrfpack.format.metadata import MAX_NESTING_DEPTH, is_too_deep, writer_name
+from hyrfpack.format.metadata import MAX_GAUSSIANS, MAX_NESTING_DEPTH, is_too_deep, writer_name
 from hyrfpack.format.part_names import ONE_PART_NAME, check_part_names, reject_constant
 from hyrfpack.format.run_folder import SCENE_MANIFEST_FILE as MANIFEST_NAME
 from hyrfpack.format.sections import MAX_PARTS
 from hyrfpack.format.shared import is_file_name
 
 FORMAT_NAME = "hyrf-scene"
-# A reader of one major version refuses the other one, and would else draw all chunks with the fields of one part.
+# The two major versions differ, so that an older reader refuses a scene of several parts. Otherwise it would draw all
+# chunks with the fields of one part.
 ONE_PART_VERSION, PARTS_VERSION = (1, 0), (2, 0)
 MAX_MANIFEST_BYTES = 1 << 24
 MAX_CHUNKS = 1 << 16
 MAX_ERROR_RADII = 16
-_MAX_INTEGER = (1 << 40) - 1
-_MAX_QUAT_LENGTH_ERROR = 1e-6  # that of `rotations.MAX_LENGTH_ERROR`, which needs numpy
+MAX_CAMERAS = 1024
+MAX_NUMBERS_PER_CAMERA = 32
+_MAX_QUAT_LENGTH_ERROR = 1e-6  # equals `rotations.MAX_LENGTH_ERROR`, whose module needs numpy
 _CHECKSUM_PATTERN = re.compile(r"[0-9a-f]{8}")
 _VERSION_PATTERN = re.compile(r"(\d{1,4})\.(\d{1,4})")
 
@@ -175,7 +177,7 @@ def parse_manifest(data: bytes, name: str = MANIFEST_NAME) -> Manifest:
         name: name of the file in error messages.
 
     Raises:
-        HyrfFormatError: the text is no manifest, is damaged, or has another major version.
+        HyrfFormatError: the text is not a manifest, is damaged, or has another major version.
     """
     try:
         if len(data) > MAX_MANIFEST_BYTES:
@@ -207,26 +209,27 @@ def _read_major_version(version: object, name: str) -> int:
 
 def _parse_values(values: Mapping[str, Any], major: int) -> Manifest:
     """Build a manifest of checked values; unknown keys are ignored, as later minor versions may add some."""
-    radii = _numbers(values, "error_radii", range(1, MAX_ERROR_RADII + 1), minimum=0)
+    radii = _get_numbers(values, "error_radii", range(1, MAX_ERROR_RADII + 1), minimum=0)
     if any(a >= b for a, b in zip((0.0, *radii), radii, strict=False)):
         raise ValueError("'error_radii' do not rise")
     parts = _parse_parts(values, major)
     chunks = tuple(
-        _parse_chunk(item, len(radii), len(parts)) for item in _list(values, "chunks", range(MAX_CHUNKS + 1))
+        _parse_chunk(item, len(radii), len(parts)) for item in _get_list(values, "chunks", range(MAX_CHUNKS + 1))
     )
     manifest = Manifest(
-        gaussians=_integer(values, "gaussians"),
+        gaussians=_get_integer(values, "gaussians"),
         parts=parts,
         chunks=chunks,
         error_radii=radii,
-        frame=_frame(values),
-        background=_typed(values, "background", bool),
-        solid=_triple(values, "solid"),
-        viewpoint=dict(_object(values, "viewpoint")),
+        frame=_get_frame(values),
+        background=_get_typed(values, "background", bool),
+        solid=_get_triple(values, "solid"),
+        viewpoint=dict(_get_object(values, "viewpoint")),
         cameras=tuple(
-            _numbers({"cameras": camera}, "cameras", range(1, 33)) for camera in _list(values, "cameras", range(1025))
+            _get_numbers({"cameras": camera}, "cameras", range(1, MAX_NUMBERS_PER_CAMERA + 1))
+            for camera in _get_list(values, "cameras", range(MAX_CAMERAS + 1))
         ),
-        **{key: _text(values, key) for key in ("title", "licence", "writer")},
+        **{key: _get_text(values, key) for key in ("title", "licence", "writer")},
     )
     if sum(chunk.levels[0].gaussians for chunk in chunks) != manifest.gaussians:
         raise ValueError(f"the chunks do not add up to {manifest.gaussians:,} Gaussians")
@@ -239,99 +242,103 @@ def _parse_values(values: Mapping[str, Any], major: int) -> Manifest:
 
 def _parse_parts(values: Mapping[str, Any], major: int) -> tuple[ScenePart, ...]:
     if major == ONE_PART_VERSION[0]:
-        return (ScenePart(**_file_values(_object(values, "shared"))),)
-    items = _list(values, "parts", range(2, MAX_PARTS + 1))
+        return (ScenePart(**_get_file_values(_get_object(values, "shared"))),)
+    items = _get_list(values, "parts", range(2, MAX_PARTS + 1))
     if not all(isinstance(item, dict) for item in items):
-        raise ValueError("a part is no object")
+        raise ValueError("a part is not an object")
     check_part_names([item.get("name") for item in items])
-    return tuple(ScenePart(**_file_values(item), name=item["name"]) for item in items)
+    return tuple(ScenePart(**_get_file_values(item), name=item["name"]) for item in items)
 
 
-def _parse_chunk(item: object, radii: int, parts: int) -> Chunk:
+def _parse_chunk(item: object, radius_count: int, part_count: int) -> Chunk:
     if not isinstance(item, dict):
-        raise ValueError("a chunk is no object")
-    low, high = _triple(item, "low"), _triple(item, "high")
+        raise ValueError("a chunk is not an object")
+    low, high = _get_triple(item, "low"), _get_triple(item, "high")
     if any(a > b for a, b in zip(low, high, strict=True)):
         raise ValueError("the box of a chunk is not in order")
     levels = []
-    for level in _list(item, "levels", range(1, MAX_LEVELS + 1)):
+    for level in _get_list(item, "levels", range(1, MAX_LEVELS + 1)):
         if not isinstance(level, dict):
-            raise ValueError("a level is no object")
-        errors = _numbers(level, "errors", range(radii, radii + 1), minimum=0)
-        levels.append(ChunkLevel(**_file_values(level), gaussians=_integer(level, "gaussians"), errors=errors))
-    part = _integer(item, "part") if parts > 1 else 0
-    if part >= parts:
-        raise ValueError(f"a chunk belongs to part {part}, and there are {parts} parts")
+            raise ValueError("a level is not an object")
+        errors = _get_numbers(level, "errors", range(radius_count, radius_count + 1), minimum=0)
+        levels.append(ChunkLevel(**_get_file_values(level), gaussians=_get_integer(level, "gaussians"), errors=errors))
+    part = _get_integer(item, "part") if part_count > 1 else 0
+    if part >= part_count:
+        raise ValueError(f"a chunk belongs to part {part}, and there are {part_count} parts")
     return Chunk(low, high, tuple(levels), part)
 
 
-def _file_values(values: Mapping[str, Any]) -> dict[str, Any]:
+def _get_file_values(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the checked attributes of a `SceneFile`."""
     name, checksum = values.get("file"), values.get("crc32")
     if not is_file_name(name):
         raise ValueError(f"{name!r:.80} is not the name of a .hyrf file in the folder")
     if not isinstance(checksum, str) or not _CHECKSUM_PATTERN.fullmatch(checksum):
         raise ValueError(f"the checksum of {name} is not 8 hexadecimal digits")
-    return {"file": name, "bytes": _integer(values, "bytes", MAX_FILE_BYTES), "crc32": checksum}
+    return {"file": name, "bytes": _get_integer(values, "bytes", MAX_FILE_BYTES), "crc32": checksum}
 
 
-def _typed(values: Mapping[str, Any], key: str, kind: type) -> Any:
+def _get_typed(values: Mapping[str, Any], key: str, kind: type) -> Any:
+    """Return the value of a key. Like all functions below, it raises ValueError if the value is not valid."""
     value = values.get(key)
     if type(value) is not kind:
         raise ValueError(f"'{key}' must be of type {kind.__name__}")
     return value
 
 
-def _object(values: Mapping[str, Any], key: str) -> dict[str, Any]:
-    return _typed(values, key, dict)
+def _get_object(values: Mapping[str, Any], key: str) -> dict[str, Any]:
+    return _get_typed(values, key, dict)
 
 
-def _list(values: Mapping[str, Any], key: str, lengths: range) -> list[Any]:
-    items = _typed(values, key, list)
+def _get_list(values: Mapping[str, Any], key: str, lengths: range) -> list[Any]:
+    items = _get_typed(values, key, list)
     if len(items) not in lengths:
         raise ValueError(f"'{key}' has {len(items):,} entries, not {lengths.start} to {lengths.stop - 1:,}")
     return items
 
 
-def _frame(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Check what places a view; the files have the whole frame."""
-    frame = _object(values, "frame")
-    _triple(frame, "center")
-    (scale,) = _numbers({"scale": [frame.get("scale")]}, "scale", range(1, 2))
+def _get_frame(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the frame after a check of what readers of the manifest need of it; the files have the whole frame."""
+    frame = _get_object(values, "frame")
+    _get_triple(frame, "center")
+    (scale,) = _get_numbers({"scale": [frame.get("scale")]}, "scale", range(1, 2))
     if scale <= 0:
         raise ValueError("'scale' must be positive")
     if "rotation" in frame:
-        length = math.hypot(*_numbers(frame, "rotation", range(4, 5)))
+        length = math.hypot(*_get_numbers(frame, "rotation", range(4, 5)))
         if abs(length - 1) > _MAX_QUAT_LENGTH_ERROR:
-            raise ValueError("'rotation' has not unit length")
+            raise ValueError("'rotation' does not have unit length")
     return dict(frame)
 
 
-def _text(values: Mapping[str, Any], key: str) -> str:
-    text = _typed(values, key, str)
+def _get_text(values: Mapping[str, Any], key: str) -> str:
+    text = _get_typed(values, key, str)
     check_text(f"'{key}'", text, MAX_TITLE_LENGTH)
     return text
 
 
-def _integer(values: Mapping[str, Any], key: str, maximum: int = _MAX_INTEGER) -> int:
+def _get_integer(values: Mapping[str, Any], key: str, maximum: int = MAX_GAUSSIANS) -> int:
+    """Return an integer from 0 to `maximum`."""
     value = values.get(key)
     if isinstance(value, float) and value.is_integer():  # such as 3.0, which JSON Schema and JavaScript accept
         value = int(value)
     else:
-        value = _typed(values, key, int)
+        value = _get_typed(values, key, int)
     if not 0 <= value <= maximum:
         raise ValueError(f"'{key}' is out of range")
     return value
 
 
-def _triple(values: Mapping[str, Any], key: str) -> tuple[float, float, float]:
-    x, y, z = _numbers(values, key, range(3, 4))
+def _get_triple(values: Mapping[str, Any], key: str) -> tuple[float, float, float]:
+    x, y, z = _get_numbers(values, key, range(3, 4))
     return x, y, z
 
 
-def _numbers(values: Mapping[str, Any], key: str, lengths: range, minimum: float = -math.inf) -> tuple[float, ...]:
-    numbers = _list(values, key, lengths)
+def _get_numbers(values: Mapping[str, Any], key: str, lengths: range, minimum: float = -math.inf) -> tuple[float, ...]:
+    """Return a list of finite numbers, at least `minimum`, whose length is one of `lengths`."""
+    numbers = _get_list(values, key, lengths)
     if not all(type(number) in (int, float) for number in numbers):
-        raise ValueError(f"'{key}' holds something else than numbers")
+        raise ValueError(f"'{key}' holds a value that is not a number")
     try:
         floats = tuple(map(float, numbers))
     except OverflowError:

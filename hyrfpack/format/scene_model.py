@@ -1,4 +1,4 @@
-"""Joins the chunks of a scene to one model."""
+"""Joins the chunks of a scene into one model."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def join_parts(
         parts: number of the part of each chunk.
     """
     models = [
-        join_chunks(own, [chunk for chunk, part in zip(chunks, parts, strict=True) if part == number])
-        for number, own in enumerate(fields)
+        join_chunks(part_fields, [chunk for chunk, part in zip(chunks, parts, strict=True) if part == number])
+        for number, part_fields in enumerate(fields)
     ]
     return models[0] if len(models) == 1 else MergedModel(tuple(names), tuple(models))

@@ -24,19 +24,20 @@ MAX_PARTS = 64
 LOGIT_SECTIONS = (COLORS, SCALES, OPACITIES)
 TABLE_SECTIONS = (GEOMETRY_TABLE, RADIANCE_TABLE)
 DECODER_SECTIONS = (GEOMETRY_DECODER, RADIANCE_DECODER)
-# Gaussians may be stored in layers, the most important first. These are the section types of the first layer.
+# Gaussians may be stored in layers, the most important first. These are the section types of the first layer, which the
+# code calls groups. `layer_section` makes the type of a section, also called its tag, of a group and a layer's number.
 LAYERED_SECTIONS = (POSITIONS, *LOGIT_SECTIONS)
 # A model with residuals has these, too, in the same layers.
 RESIDUAL_SECTIONS = (SHAPES, HARMONICS)
 MAX_LAYERS = 8
+# These sections hold no parameters of the model.
+NON_PARAMETER_SECTIONS = (METADATA, EXPOSURE)
 
 
 def part_section(number: int) -> str:
     """Return the section type of a part of a merged file, from 0: "PT00", "PT01", ..."""
     return f"PT{number:02d}"
 
-
-NON_PARAMETER_SECTIONS = (METADATA, EXPOSURE)
 
 # Content of each section type. In a file of one model, every section of a model except EXPOSURE is required, and the
 # residuals are if the configuration says so.

@@ -79,10 +79,10 @@ def read_section(container: Container, tag: str) -> Section:
 
 def read_provenance(container: Container) -> dict:
     """Return the provenance of a file. A chunk of a scene has that of the file with its shared sections, too."""
-    own = deepcopy(read_metadata(container).provenance)
+    provenance = deepcopy(read_metadata(container).provenance)
     if not has_shared_sections(container):
-        return own
-    return {**deepcopy(read_metadata(open_shared(container)).provenance), **own}
+        return provenance
+    return {**deepcopy(read_metadata(open_shared(container)).provenance), **provenance}
 
 
 def self_contained_bytes(container: Container) -> bytes:

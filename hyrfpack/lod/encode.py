@@ -21,7 +21,7 @@ from hyrfpack.format.compact.channels import (
     read_basis,
     read_channel_header,
 )
-from hyrfpack.format.compact.groups import encode_use_classes
+from hyrfpack.format.compact.groups import encode_usage_classes
 from hyrfpack.format.compact.plan import USAGE_CLASS_COUNT, build_step_groups
 from hyrfpack.format.compact.quantized import (
     CODEC_CHANNELS,
@@ -188,7 +188,7 @@ class ChunkEncoder:
         for place, section in enumerate(sections):
             if section.type in TABLE_SECTIONS and section.codec == CODEC_GROUPS:
                 groups = build_step_groups(section.type, config, self._layers[0].points)
-                uses = encode_use_classes(groups, grid_configs(config)[section.type].offsets, USAGE_CLASS_COUNT)
+                uses = encode_usage_classes(groups, grid_configs(config)[section.type].offsets, USAGE_CLASS_COUNT)
                 sections[place] = replace(section, codec=CODEC_STATED_GROUPS, data=uses + bytes(section.data))
         metadata = replace(self.metadata, gaussians=0, layers=[], writer=writer_name())
         return _encode_file(metadata, [*sections, *empty], deflate=self.is_compact)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+MAX_WEIGHT_SIXTEENTHS = 16
 _PLACES_PER_BLOCK = 1 << 14  # Temporary arrays of this size stay in the caches.
 
 
@@ -37,7 +38,7 @@ def predict(values: np.ndarray, places: np.ndarray, distance: int, weight: int) 
         values: (N,) int64 decoded numbers.
         places: (n,) indices from `iter_levels`, 2 d apart.
         distance: d.
-        weight: weight of the prediction in 16ths, 0 to 16.
+        weight: weight of the prediction in 16ths, 0 to MAX_WEIGHT_SIXTEENTHS.
 
     Returns:
         (n,) int64.
@@ -61,7 +62,7 @@ def lift(
 
     Args:
         count: N.
-        weight: weight of the prediction in 16ths, 0 to 16.
+        weight: weight of the prediction in 16ths, 0 to MAX_WEIGHT_SIXTEENTHS.
         steps: (N,) int64 quantisation steps.
         choose: function of indices (n,) and predictions (n,) that returns the differences (n,) int64, in steps.
 

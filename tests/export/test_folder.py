@@ -286,7 +286,7 @@ def test_a_manifest_is_named_after_its_folder_before_and_after_the_work(tmp_path
     assert ">city</a>" in (tmp_path / "new" / "index.html").read_text()
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "city.hyrf").touch()
-    monkeypatch.setattr("hyrfpack.export.folder.single_file", lambda source: pytest.fail("the work began"))
+    monkeypatch.setattr("hyrfpack.export.folder.as_single_file", lambda source: pytest.fail("the work began"))
     with pytest.raises(HyrfError, match=r"city\.hyrf of the files to be written is there"):
         export_gallery([manifest], tmp_path / "old", overwrite=False)
 

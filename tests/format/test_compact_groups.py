@@ -16,9 +16,9 @@ from hyrfpack.format.compact.groups import (
     MAX_ABS_SYMBOL,
     StepGroups,
     decode_groups,
-    decode_use_classes,
+    decode_usage_classes,
     encode_groups,
-    encode_use_classes,
+    encode_usage_classes,
 )
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import encode_integers
@@ -136,7 +136,7 @@ LEVEL_OFFSETS = (0, 8, 35, 99)  # first rows of three levels, and the number of 
 
 
 def stated_groups(seed: int = 0) -> StepGroups:
-    """Return groups of the two numbers of each row: a use class below 11 for each row of a level."""
+    """Return groups of the two numbers of each row: a usage class below 11 for each row of a level."""
     levels = np.repeat(np.arange(3), np.diff(LEVEL_OFFSETS))
     uses = np.random.default_rng(seed).integers(11, size=len(levels))
     return StepGroups(np.repeat(16 * levels + uses, 2).astype(np.uint16), 48)
@@ -145,8 +145,8 @@ def stated_groups(seed: int = 0) -> StepGroups:
 def test_stated_groups_are_decoded_as_they_were_encoded_and_leave_the_rest() -> None:
     groups = stated_groups()
 
-    decoded, rest = decode_use_classes(
-        memoryview(encode_use_classes(groups, LEVEL_OFFSETS, 16) + b"rest"), LEVEL_OFFSETS, 16
+    decoded, rest = decode_usage_classes(
+        memoryview(encode_usage_classes(groups, LEVEL_OFFSETS, 16) + b"rest"), LEVEL_OFFSETS, 16
     )
 
     np.testing.assert_array_equal(decoded.index, groups.index)
@@ -155,14 +155,14 @@ def test_stated_groups_are_decoded_as_they_were_encoded_and_leave_the_rest() -> 
 
 @given(st.data())
 @examples(100)
-def test_damaged_use_classes_are_refused_or_in_range(data: st.DataObject) -> None:
-    damaged = bytearray(encode_use_classes(stated_groups(), LEVEL_OFFSETS, 16))
+def test_damaged_usage_classes_are_refused_or_in_range(data: st.DataObject) -> None:
+    damaged = bytearray(encode_usage_classes(stated_groups(), LEVEL_OFFSETS, 16))
     for _ in range(data.draw(st.integers(1, 3))):
         damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
     length = data.draw(st.integers(0, len(damaged)))
 
     try:
-        decoded, _ = decode_use_classes(memoryview(bytes(damaged))[:length], LEVEL_OFFSETS, 16)
+        decoded, _ = decode_usage_classes(memoryview(bytes(damaged))[:length], LEVEL_OFFSETS, 16)
     except DamagedDataError:
         return
     assert decoded.index.shape == (198,) and decoded.index.max() < 48

@@ -14,7 +14,7 @@ from property_tests import examples
 from hyrfpack.format.compact.residuals import (
     BASIS_BYTES,
     MAX_ABS_SYMBOL,
-    MAX_CLASSES,
+    MAX_RESIDUAL_CLASSES,
     ResidualSymbols,
     decode_residual_symbols,
     decode_residuals,
@@ -52,7 +52,7 @@ SAMPLE_DATA = encode_residuals(HARMONICS, SAMPLE_RESIDUALS[0], SAMPLE_RESIDUALS[
 @given(
     st.sampled_from([(SHAPES, SHAPE_COLUMNS), *((HARMONICS, 3 * (degree + 1) ** 2) for degree in range(4))]),
     st.integers(0, 80),
-    st.integers(1, MAX_CLASSES),
+    st.integers(1, MAX_RESIDUAL_CLASSES),
     st.sampled_from([0.0, 0.1, 0.7, 1.0]),
     st.sampled_from([0, 1, 300, MAX_ABS_SYMBOL]),
     st.integers(0, 2**32 - 1),
@@ -109,7 +109,7 @@ def test_a_flag_of_2_is_refused() -> None:
         )
 
 
-@pytest.mark.parametrize("class_count", [0, 1, MAX_CLASSES + 1])
+@pytest.mark.parametrize("class_count", [0, 1, MAX_RESIDUAL_CLASSES + 1])
 def test_classes_without_a_step_and_too_many_steps_are_refused(class_count: int) -> None:
     residuals, classes, _ = random_residuals(SHAPES, SHAPE_COLUMNS, 20, 2, 0.5)
     data = bytes([class_count]) + encode_residuals(SHAPES, residuals, classes)[1:]

@@ -28,7 +28,7 @@ from hyrfpack.format import describe_file, load_merged_model, load_model, save_m
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.container import MINOR_VERSION, Container, Section, read_container, write_container
 from hyrfpack.format.parts import encode_parts
-from hyrfpack.format.scene_folder import SceneFolder, is_scene, single_file
+from hyrfpack.format.scene_folder import SceneFolder, as_single_file, is_scene
 from hyrfpack.format.sections import SECTION_CONTENTS
 from hyrfpack.format.shared import CODEC_SHARED
 from hyrfpack.lod import LevelRenderer, split, split_model
@@ -510,7 +510,7 @@ def test_commands_read_a_scene_like_a_file(folder, tmp_path):
         for first, second in zip(load_model(joined).parameters(), load_model(folder).parameters(), strict=True):
             assert torch.equal(first, second)
     assert len(load_merged_model(folder)) == 1500
-    with single_file(folder) as file:
+    with as_single_file(folder) as file:
         assert file.name == "demo-scene.hyrf"
 
 

@@ -23,7 +23,7 @@ from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import describe_file, load_merged_model, load_model, save_model, scene_manifest
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import load_parts, load_with_provenance
-from hyrfpack.format.scene_folder import SceneFolder, single_file
+from hyrfpack.format.scene_folder import SceneFolder, as_single_file
 from hyrfpack.lod import LevelRenderer, split, split_model
 from hyrfpack.model.merged import MergedModel
 from hyrfpack.render import render_view
@@ -152,7 +152,7 @@ def test_commands_read_the_folder_like_the_merged_file(folder, merged_file, tmp_
     assert [part["provenance"] for part in info["parts"]] == [part[2] for part in load_parts(merged_file)]
     assert sum(part["bytes"] for part in info["parts"]) == info["bytes"]
     assert "3,000 Gaussians in 4 chunks" in text and "second" in text
-    with single_file(folder) as file:
+    with as_single_file(folder) as file:
         for joined in (tmp_path / "joined.hyrf", tmp_path / "player" / "scene.hyrf", file):
             assert load_merged_model(joined).names == ("first", "second")
     provenances = [[part[2] for part in load_parts(path)] for path in (tmp_path / "joined.hyrf", merged_file)]

@@ -672,7 +672,7 @@ def stated_groups(source: Cursor, grid: dict[str, int]) -> tuple[np.ndarray, int
     rows = [rows for _, rows in grid_levels(grid)]
     levels = np.repeat(np.arange(len(rows)), rows)
     uses = read_integers(source.take(source.unpack("I")[0]), levels)
-    require(bool((uses < 16).all()), "codec 11: use class out of range")
+    require(bool((uses < 16).all()), "codec 11: usage class out of range")
     return np.repeat(16 * levels + uses, 2), 16 * len(rows)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.arrays import grid_configs
-from hyrfpack.format.compact.groups import decode_groups, decode_use_classes
+from hyrfpack.format.compact.groups import decode_groups, decode_usage_classes
 from hyrfpack.format.compact.plan import USAGE_CLASS_COUNT, build_step_groups, lattice_to_local
 from hyrfpack.format.compact.quantized import (
     CODEC_CHANNELS,
@@ -86,8 +86,8 @@ def decode_section(
     if group in DECODER_SECTIONS:
         return decode_groups(data, build_step_groups(group, config)).reshape(shape)
     if codec == CODEC_STATED_GROUPS:
-        groups, rest = decode_use_classes(data, grid_configs(config)[group].offsets, USAGE_CLASS_COUNT)
-        return decode_groups(rest, groups).reshape(shape)
+        groups, data = decode_usage_classes(data, grid_configs(config)[group].offsets, USAGE_CLASS_COUNT)
+        return decode_groups(data, groups).reshape(shape)
     if points is None:
         raise HyrfFormatError(f"codec {codec} needs positions of codec {CODEC_POINTS}", fix="write the file again")
     if codec == CODEC_RESIDUALS:

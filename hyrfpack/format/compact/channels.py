@@ -13,7 +13,7 @@ import numpy as np
 
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import decode_integers, encode_integers
-from hyrfpack.quant.lifting import inverse_lift
+from hyrfpack.quant.lifting import MAX_WEIGHT_SIXTEENTHS, inverse_lift
 from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 
 MAX_ABS_CHANNEL_VALUE = 4096.0  # keeps fixed-point sums well within 64 bits
@@ -28,7 +28,7 @@ class Channel:
 
     Attributes:
         mean: float32 that is added to every number.
-        weight: weight of the prediction in 16ths, 0 to 16.
+        weight: weight of the prediction in 16ths, 0 to MAX_WEIGHT_SIXTEENTHS.
         codes: (K,) uint8 step code of each class.
         residuals: (N,) int64 differences from the prediction, in steps.
         values: (N,) float64 numbers as they will be decoded.
@@ -50,8 +50,8 @@ def encode_channel(channel: Channel, classes: np.ndarray) -> bytes:
 
 def read_channel_header(data: memoryview) -> tuple[np.float32, int, np.ndarray]:
     """Return mean, weight and step codes from the start of a channel's bytes, which `decode_channel` has checked."""
-    mean, weight, _, kinds = _HEADER_STRUCT.unpack_from(data)
-    codes = np.frombuffer(data[_HEADER_STRUCT.size : _HEADER_STRUCT.size + kinds], np.uint8)
+    mean, weight, _, class_count = _HEADER_STRUCT.unpack_from(data)
+    codes = np.frombuffer(data[_HEADER_STRUCT.size : _HEADER_STRUCT.size + class_count], np.uint8)
     return np.float32(mean), weight, codes
 
 
@@ -70,13 +70,13 @@ def decode_channel(data: memoryview, classes: np.ndarray) -> tuple[np.ndarray, m
     """
     if len(data) < _HEADER_STRUCT.size:
         raise DamagedDataError(f"a channel's header takes more than the {len(data)} bytes left; it is truncated")
-    mean, weight, size, kinds = _HEADER_STRUCT.unpack_from(data)
-    start = _HEADER_STRUCT.size + kinds
+    mean, weight, size, class_count = _HEADER_STRUCT.unpack_from(data)
+    start = _HEADER_STRUCT.size + class_count
     if (
         start + size > len(data)
         or not abs(mean) <= MAX_ABS_CHANNEL_VALUE
-        or weight > 16
-        or kinds <= int(classes.max(initial=0))
+        or weight > MAX_WEIGHT_SIXTEENTHS
+        or class_count <= int(classes.max(initial=0))
     ):
         raise DamagedDataError("a channel's header has impossible values; it is damaged")
     steps = decode_step(np.frombuffer(data[_HEADER_STRUCT.size : start], np.uint8))
@@ -84,11 +84,9 @@ def decode_channel(data: memoryview, classes: np.ndarray) -> tuple[np.ndarray, m
     # Encoders stay within 2 MAX_ABS_CHANNEL_VALUE; sums of far larger differences could overflow.
     limits = np.minimum(int(8 * MAX_ABS_CHANNEL_VALUE * FIXED_POINT_ONE) // steps, 1 << 30).astype(np.int32)
     for first in range(0, len(classes), _NUMBERS_PER_BLOCK):
-        part, largest = (
-            residuals[first : first + _NUMBERS_PER_BLOCK],
-            limits[classes[first : first + _NUMBERS_PER_BLOCK]],
-        )
-        if ((part > largest) | (part < -largest)).any():
+        block = slice(first, first + _NUMBERS_PER_BLOCK)
+        part, limit = residuals[block], limits[classes[block]]
+        if ((part > limit) | (part < -limit)).any():
             raise DamagedDataError(f"a channel holds differences beyond {8 * MAX_ABS_CHANNEL_VALUE:.0f}; it is damaged")
     numbers = inverse_lift(residuals, weight, steps[classes])
     del residuals

@@ -4,8 +4,9 @@ The symbols of a group are coded with one of a few entropy models, chosen by the
 symbols. The bytes are: u32 length of the stream of step codes, u32 length of the stream of models, these two streams,
 and the stream of the symbols.
 
-Groups of a table that other files share are stated (section codec 11), because its readers do not have the positions
-from which they were found: u32 length of the stream of use classes, this stream, and the bytes above.
+The groups of a table that other files share are stored, too (section codec 11, "stated groups"), because its readers
+do not have the positions
+from which encoders find them: u32 length of the stream of usage classes, this stream, and the bytes above.
 """
 
 from __future__ import annotations
@@ -69,12 +70,13 @@ class GroupSymbols:
     values: np.ndarray
 
 
-def encode_groups(chosen: GroupSymbols, groups: StepGroups) -> bytes:
+def encode_groups(quantized: GroupSymbols, groups: StepGroups) -> bytes:
     """Encode quantised numbers in groups as bytes."""
-    coded = groups.gather(chosen.codes != ALL_ZERO_CODE)
-    codes = encode_integers(chosen.codes)
-    models = encode_integers(chosen.models[chosen.codes != ALL_ZERO_CODE])
-    symbols = encode_integers(chosen.symbols[coded], groups.gather(chosen.models)[coded], signed=True)
+    is_coded_group = quantized.codes != ALL_ZERO_CODE
+    is_coded = groups.gather(is_coded_group)
+    codes = encode_integers(quantized.codes)
+    models = encode_integers(quantized.models[is_coded_group])
+    symbols = encode_integers(quantized.symbols[is_coded], groups.gather(quantized.models)[is_coded], signed=True)
     return _HEADER_STRUCT.pack(len(codes), len(models)) + codes + models + symbols
 
 
@@ -93,34 +95,36 @@ def decode_groups(data: memoryview, groups: StepGroups) -> np.ndarray:
     """
     if len(data) < _HEADER_STRUCT.size or sum(_HEADER_STRUCT.unpack_from(data)) > len(data) - _HEADER_STRUCT.size:
         raise DamagedDataError(f"the lengths of its parts do not fit its {len(data)} bytes; it is damaged")
-    first, second = _HEADER_STRUCT.unpack_from(data)
+    code_bytes, model_bytes = _HEADER_STRUCT.unpack_from(data)
     data = data[_HEADER_STRUCT.size :]
-    codes = decode_integers(data[:first], groups.count)
+    codes = decode_integers(data[:code_bytes], groups.count)
     if codes.max(initial=0) > 255:
         raise DamagedDataError(f"the step code {codes.max()} is above 255; it is damaged")
-    used = codes != ALL_ZERO_CODE
-    chosen = decode_integers(data[first : first + second], int(np.count_nonzero(used)))
-    if chosen.max(initial=0) >= ENTROPY_MODEL_COUNT:
-        raise DamagedDataError(f"the model {chosen.max()} of {ENTROPY_MODEL_COUNT}; it is damaged")
+    is_coded_group = codes != ALL_ZERO_CODE
+    coded_models = decode_integers(data[code_bytes : code_bytes + model_bytes], int(np.count_nonzero(is_coded_group)))
+    if coded_models.max(initial=0) >= ENTROPY_MODEL_COUNT:
+        raise DamagedDataError(
+            f"a group has the entropy model {coded_models.max()}, and there are {ENTROPY_MODEL_COUNT}; it is damaged"
+        )
     models = np.full(groups.count, ENTROPY_MODEL_COUNT, np.uint8)
-    models[used] = chosen
+    models[is_coded_group] = coded_models
     contexts = groups.gather(models)
-    coded = contexts < ENTROPY_MODEL_COUNT
-    contexts = contexts[coded]
-    symbols = decode_integers(data[first + second :], len(contexts), contexts, signed=True)
+    is_coded = contexts < ENTROPY_MODEL_COUNT
+    contexts = contexts[is_coded]
+    symbols = decode_integers(data[code_bytes + model_bytes :], len(contexts), contexts, signed=True)
     if symbols.max(initial=0) > MAX_ABS_SYMBOL or symbols.min(initial=0) < -MAX_ABS_SYMBOL:
         raise DamagedDataError(f"a number is more than {MAX_ABS_SYMBOL} steps; it is damaged")
     values = np.zeros(len(groups.index), np.float32)
-    steps, place = decode_step(codes) / FIXED_POINT_ONE, 0
-    for part in iter_blocks(len(values)):
-        index = groups.index[part][coded[part]]
-        values[part][coded[part]] = symbols[place : place + len(index)] * steps[index]
-        place += len(index)
+    steps, start = decode_step(codes) / FIXED_POINT_ONE, 0
+    for block in iter_blocks(len(values)):
+        index = groups.index[block][is_coded[block]]
+        values[block][is_coded[block]] = symbols[start : start + len(index)] * steps[index]
+        start += len(index)
     return values
 
 
-def encode_use_classes(groups: StepGroups, offsets: Sequence[int], classes_per_level: int) -> bytes:
-    """Encode the groups of a table's rows as bytes that go before those of `encode_groups`.
+def encode_usage_classes(groups: StepGroups, offsets: Sequence[int], classes_per_level: int) -> bytes:
+    """Encode the usage classes of a table's rows as bytes that go before those of `encode_groups`.
 
     Args:
         groups: groups of the table's numbers, two for each row.
@@ -132,20 +136,22 @@ def encode_use_classes(groups: StepGroups, offsets: Sequence[int], classes_per_l
     return _LENGTH_STRUCT.pack(len(stream)) + stream
 
 
-def decode_use_classes(
+def decode_usage_classes(
     data: memoryview, offsets: Sequence[int], classes_per_level: int
 ) -> tuple[StepGroups, memoryview]:
-    """Decode the groups of a table's rows; return them and the bytes that follow.
+    """Decode the usage classes of a table's rows; return the groups that they make, and the bytes that follow.
 
     Raises:
         DamagedDataError: the bytes are truncated, damaged or inconsistent.
     """
     if len(data) < _LENGTH_STRUCT.size or _LENGTH_STRUCT.unpack_from(data)[0] > len(data) - _LENGTH_STRUCT.size:
-        raise DamagedDataError(f"its use classes do not fit its {len(data)} bytes; it is damaged")
+        raise DamagedDataError(f"its usage classes do not fit its {len(data)} bytes; it is damaged")
     end = _LENGTH_STRUCT.size + _LENGTH_STRUCT.unpack_from(data)[0]
     levels = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     classes = decode_integers(data[_LENGTH_STRUCT.size : end], len(levels), levels.astype(np.uint8))
     if classes.max(initial=0) >= classes_per_level:
-        raise DamagedDataError(f"the use class {classes.max()} of {classes_per_level}; it is damaged")
+        raise DamagedDataError(
+            f"a row has the usage class {classes.max()}, and there are {classes_per_level}; it is damaged"
+        )
     index = (classes_per_level * levels + classes).astype(np.uint16)
     return StepGroups(np.repeat(index, 2), classes_per_level * (len(offsets) - 1)), data[end:]

@@ -66,8 +66,8 @@ class Plan:
         arrays = to_arrays(model)
         for group in (*LOGIT_SECTIONS, *residual_widths(model.config)):
             arrays[group] = arrays[group][self.kept]
-        places = [lattice_to_local(layer.points, model.config.frame) for layer in self.layers]
-        arrays[POSITIONS] = np.concatenate(places)
+        positions = [lattice_to_local(layer.points, model.config.frame) for layer in self.layers]
+        arrays[POSITIONS] = np.concatenate(positions)
         stored = to_model(model.config, arrays).to(model.gaussians.positions.device)
         sizes = model.gaussians.pixel_sizes
         stored.gaussians.pixel_sizes = None if sizes is None else sizes[torch.from_numpy(self.kept).to(sizes.device)]
@@ -79,9 +79,9 @@ def lattice_to_local(points: LatticePoints, frame: Frame) -> np.ndarray:
     """Return local positions (N, 3) float32 of the centres of the points' cells."""
     local = np.empty(points.cells.shape, np.float32)
     for first in range(0, len(local), GAUSSIANS_PER_BLOCK):
-        part = slice(first, first + GAUSSIANS_PER_BLOCK)
-        cube = torch.from_numpy(points[part].centers() / float(2 << MAX_BITS_PER_AXIS))
-        local[part] = (expand(cube) * cube.new_tensor(frame.half_extent)).float().numpy()
+        block = slice(first, first + GAUSSIANS_PER_BLOCK)
+        cube = torch.from_numpy(points[block].centers() / float(2 << MAX_BITS_PER_AXIS))
+        local[block] = (expand(cube) * cube.new_tensor(frame.half_extent)).float().numpy()
     return local
 
 
@@ -103,8 +103,8 @@ def build_step_groups(group: str, config: ModelConfig, points: LatticePoints | N
         return StepGroups(np.repeat(np.arange(len(sizes)), sizes), len(sizes))
     assert points is not None
     grid = grid_configs(config)[group]
-    every = max(1, -(-len(points.cells) // MAX_COUNTED_GAUSSIANS))
-    usage = grid.count_row_reads(points[::every].centers(), MAX_BITS_PER_AXIS + 1)
+    stride = max(1, -(-len(points.cells) // MAX_COUNTED_GAUSSIANS))
+    usage = grid.count_row_reads(points[::stride].centers(), MAX_BITS_PER_AXIS + 1)
     index, count = np.empty((grid.rows, FEATURES_PER_LEVEL), np.uint16), grid.levels * USAGE_CLASS_COUNT
     for level, (first, last) in enumerate(pairwise(grid.offsets)):
         length = np.frexp(usage[first:last].astype(np.float64))[1]  # number of binary digits, 0 for 0

@@ -57,14 +57,15 @@ class QuantizedModel:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return float32 numbers as they will be decoded, by section: flat tables and decoders, logits (M, columns)."""
-        arrays = {group: chosen.values for group, chosen in self.groups.items()}
+        arrays = {group: symbols.values for group, symbols in self.groups.items()}
         for group in self.channels[0]:
             layers = [[channel.values for channel in layer[group]] for layer in self.channels]
             arrays[group] = np.concatenate([_join_channels(values, self.plan.basis) for values in layers])
         for group in self.residuals[0] if self.residuals else ():
             basis = self.plan.basis if group == HARMONICS else None
             pairs = zip(self.residuals, self.plan.layers, strict=True)
-            arrays[group] = np.concatenate([each[group].values(layer.points.classes, basis) for each, layer in pairs])
+            parts = [residuals[group].values(layer.points.classes, basis) for residuals, layer in pairs]
+            arrays[group] = np.concatenate(parts)
         return arrays
 
 
@@ -102,14 +103,14 @@ def encode(model: HybridModel, quantized: QuantizedModel) -> tuple[list[Section]
     widths = residual_widths(model.config)
     groups = (*LAYERED_SECTIONS, *widths)
     jobs: dict[str, Callable[[], Section]] = {group: partial(encode_numbers, group) for group in plan.groups}
-    for layer in range(len(plan.layers)):
-        jobs[layer_section(POSITIONS, layer)] = partial(encode_positions, layer)
-        jobs |= {layer_section(group, layer): partial(encode_channels, layer, group) for group in LOGIT_COLUMNS}
-        jobs |= {layer_section(group, layer): partial(encode_layer_residuals, layer, group) for group in widths}
-    done = run_jobs(jobs)
-    further = [layer_section(group, layer) for layer in range(1, len(plan.layers)) for group in groups]
+    for number in range(len(plan.layers)):
+        jobs[layer_section(POSITIONS, number)] = partial(encode_positions, number)
+        jobs |= {layer_section(group, number): partial(encode_channels, number, group) for group in LOGIT_COLUMNS}
+        jobs |= {layer_section(group, number): partial(encode_layer_residuals, number, group) for group in widths}
+    sections = run_jobs(jobs)
+    later_layers = [layer_section(group, number) for number in range(1, len(plan.layers)) for group in groups]
     settings = {"distortion": plan.distortion_per_number, "gaussians_before": plan.gaussians_before}
-    return [done[tag] for tag in (*DECODER_SECTIONS, *groups, *TABLE_SECTIONS, *further)], settings
+    return [sections[tag] for tag in (*DECODER_SECTIONS, *groups, *TABLE_SECTIONS, *later_layers)], settings
 
 
 def decode_channels(data: memoryview, points: LatticePoints, columns: int) -> np.ndarray:
@@ -147,8 +148,8 @@ def _join_channels(channels: list[np.ndarray], basis: np.ndarray) -> np.ndarray:
         return channels[0][:, None].astype(np.float32)
     joined = np.empty((len(channels[0]), 3), np.float32)
     for start in range(0, len(joined), _GAUSSIANS_PER_BLOCK):
-        part = slice(start, start + _GAUSSIANS_PER_BLOCK)
+        block = slice(start, start + _GAUSSIANS_PER_BLOCK)
         for column in range(3):
-            first, second, third = (values[part] * float(basis[column, j]) for j, values in enumerate(channels))
-            joined[part, column] = first + second + third
+            first, second, third = (values[block] * float(basis[column, j]) for j, values in enumerate(channels))
+            joined[block, column] = first + second + third
     return joined

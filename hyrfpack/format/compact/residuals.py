@@ -17,7 +17,7 @@ from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import decode_integers, encode_integers
 from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
 
-MAX_CLASSES = 16
+MAX_RESIDUAL_CLASSES = 16
 MAX_ABS_SYMBOL = 1 << 24
 _HEADER_STRUCT = struct.Struct("<BI")
 _LENGTH_STRUCT = struct.Struct("<I")
@@ -63,11 +63,15 @@ class ResidualSymbols:
     codes: list[np.ndarray]
     symbols: list[np.ndarray]
 
-    def numbers(self, classes: np.ndarray) -> np.ndarray:
-        """Return the numbers (M, columns) float64 of the Gaussians with residuals; `classes` (N,) are those of all."""
-        chosen = classes[self.flags]
+    def coded_components(self, classes: np.ndarray) -> np.ndarray:
+        """Return the numbers (M, columns) float64 of the Gaussians with residuals, colours in the basis of the section.
+
+        `classes` (N,) are those of all Gaussians.
+        """
+        coded_classes = classes[self.flags]
         steps = [decode_step(codes) / FIXED_POINT_ONE for codes in self.codes]
-        return np.concatenate([s * step[chosen][:, None] for s, step in zip(self.symbols, steps, strict=True)], axis=1)
+        bands = zip(self.symbols, steps, strict=True)
+        return np.concatenate([symbols * step[coded_classes][:, None] for symbols, step in bands], axis=1)
 
     def values(self, classes: np.ndarray, basis: np.ndarray | None = None) -> np.ndarray:
         """Return the residuals (N, columns) float32 as they will be decoded.
@@ -76,9 +80,9 @@ class ResidualSymbols:
             classes: (N,) class of each Gaussian.
             basis: (3, 3) float32 for colours, see `join_colors`.
         """
-        numbers = self.numbers(classes)
-        result = np.zeros((len(classes), numbers.shape[1]), np.float32)
-        result[self.flags] = numbers if basis is None else join_colors(numbers, basis)
+        components = self.coded_components(classes)
+        result = np.zeros((len(classes), components.shape[1]), np.float32)
+        result[self.flags] = components if basis is None else join_colors(components, basis)
         return result
 
 
@@ -104,10 +108,10 @@ def encode_residuals(
     parts = [_HEADER_STRUCT.pack(class_count, len(flags)), flags]
     if basis is not None:
         parts.append(basis.astype("<f4").tobytes())
-    chosen = classes[residuals.flags]
+    coded_classes = classes[residuals.flags]
     bands = residual_bands(group, sum(symbols.shape[1] for symbols in residuals.symbols))
     for band, codes, symbols in zip(bands, residuals.codes, residuals.symbols, strict=True):
-        contexts = band.contexts(chosen, class_count).ravel()
+        contexts = band.contexts(coded_classes, class_count).ravel()
         stream = encode_integers(symbols.ravel(), contexts, signed=True)
         parts += [codes.tobytes(), _LENGTH_STRUCT.pack(len(stream)), stream]
     return b"".join(parts)
@@ -127,9 +131,9 @@ def decode_residual_symbols(
     Raises:
         DamagedDataError: the bytes are truncated, damaged or inconsistent.
     """
-    source = _Source(data)
+    source = _ByteSource(data)
     class_count, size = _HEADER_STRUCT.unpack(source.take(_HEADER_STRUCT.size))
-    if not int(classes.max(initial=0)) < class_count <= MAX_CLASSES:
+    if not int(classes.max(initial=0)) < class_count <= MAX_RESIDUAL_CLASSES:
         raise DamagedDataError(f"it has the steps of {class_count} classes; it is damaged")
     flags = decode_integers(source.take(size), len(classes), classes)
     if flags.max(initial=0) > 1:
@@ -137,18 +141,18 @@ def decode_residual_symbols(
     flags, basis = flags.astype(bool), None
     if group == HARMONICS:
         basis = read_basis(source.take(BASIS_BYTES))
-    chosen, all_codes, all_symbols = classes[flags], [], []
+    coded_classes, all_codes, all_symbols = classes[flags], [], []
     for band in residual_bands(group, columns):
         codes = np.frombuffer(source.take(class_count), np.uint8)
         (size,) = _LENGTH_STRUCT.unpack(source.take(_LENGTH_STRUCT.size))
-        contexts = band.contexts(chosen, class_count).ravel()
+        contexts = band.contexts(coded_classes, class_count).ravel()
         symbols = decode_integers(source.take(size), len(contexts), contexts, signed=True)
         if symbols.max(initial=0) > MAX_ABS_SYMBOL or symbols.min(initial=0) < -MAX_ABS_SYMBOL:
             raise DamagedDataError(f"a residual is more than {MAX_ABS_SYMBOL} steps; it is damaged")
         all_codes.append(codes)
-        all_symbols.append(symbols.reshape(len(chosen), band.width))
-    if left := source.left:
-        raise DamagedDataError(f"{left} bytes follow its last band; it is damaged")
+        all_symbols.append(symbols.reshape(len(coded_classes), band.width))
+    if source.remaining_bytes:
+        raise DamagedDataError(f"{source.remaining_bytes} bytes follow its last band; it is damaged")
     return ResidualSymbols(flags, all_codes, all_symbols), basis
 
 
@@ -158,20 +162,20 @@ def decode_residuals(group: str, data: memoryview, classes: np.ndarray, columns:
     return residuals.values(classes, basis)
 
 
-class _Source:
-    """Takes bytes from the start of a section."""
+class _ByteSource:
+    """The bytes of a section, which are taken from its start."""
 
     def __init__(self, data: memoryview) -> None:
-        self._data, self._place = data, 0
+        self._data, self._position = data, 0
 
     def take(self, count: int) -> memoryview:
         """Return the next bytes; raise DamagedDataError if there are fewer."""
-        if count > self.left:
-            raise DamagedDataError(f"it ends {count - self.left} bytes too early; it is truncated")
-        self._place += count
-        return self._data[self._place - count : self._place]
+        if count > self.remaining_bytes:
+            raise DamagedDataError(f"it ends {count - self.remaining_bytes} bytes too early; it is truncated")
+        self._position += count
+        return self._data[self._position - count : self._position]
 
     @property
-    def left(self) -> int:
-        """The number of bytes that are left."""
-        return len(self._data) - self._place
+    def remaining_bytes(self) -> int:
+        """The number of bytes that have not been taken."""
+        return len(self._data) - self._position
