@@ -43,15 +43,15 @@ def pack_bits(values: np.ndarray, lengths: np.ndarray) -> bytes:
         starts += np.uint64(position)
         position = int(starts[-1])
         starts -= length
-        offsets, places = starts & np.uint64(63), starts >> np.uint64(6)
+        offsets, word_index = starts & np.uint64(63), starts >> np.uint64(6)
         # Values do not overlap, so that adding them joins them. Only the last value that starts in a word can reach
         # into the next word; since no value is longer than a word, a value starts in every word.
-        heads = np.append(0, np.flatnonzero(places[1:] != places[:-1]) + 1)
+        heads = np.append(0, np.flatnonzero(word_index[1:] != word_index[:-1]) + 1)
         tails = np.append(heads[1:], len(entries)) - 1
-        np.add.at(words, places[heads].astype(np.int64), np.add.reduceat(entries << offsets, heads))
+        np.add.at(words, word_index[heads].astype(np.int64), np.add.reduceat(entries << offsets, heads))
         # Two shifts are used, because one shift by all 64 bits would be undefined.
-        reach = entries[tails] >> np.uint64(1) >> (np.uint64(63) - offsets[tails])
-        np.add.at(words, places[tails].astype(np.int64) + 1, reach)
+        overflow = entries[tails] >> np.uint64(1) >> (np.uint64(63) - offsets[tails])
+        np.add.at(words, word_index[tails].astype(np.int64) + 1, overflow)
     return words.astype("<u8").tobytes()[: (bits + 7) // 8]
 
 
@@ -107,18 +107,19 @@ class BitReader:
         bits = int(starts[-1]) if len(starts) else 0
         starts -= length
         starts += np.uint64(self._position % 64)
-        words = self._words(self._position // 64, (self._position + bits) // 64 + 2)
+        words = self._read_words(self._position // 64, (self._position + bits) // 64 + 2)
         self._position += bits
-        offsets, places = starts & np.uint64(63), (starts >> np.uint64(6)).view(np.int64)
+        offsets, word_index = starts & np.uint64(63), (starts >> np.uint64(6)).view(np.int64)
         # Two shifts are used, because one shift by all 64 bits would be undefined.
-        values = words[places] >> offsets | words[places + 1] << np.uint64(1) << (np.uint64(63) - offsets)
+        values = words[word_index] >> offsets | words[word_index + 1] << np.uint64(1) << (np.uint64(63) - offsets)
         return values & ((np.uint64(1) << length) - np.uint64(1))
 
-    def words(self) -> np.ndarray:
+    def read_all_words(self) -> np.ndarray:
         """Return all bits as uint64 words, lowest bits first; at least 64 zero bits follow the last bit."""
-        return self._words(0, len(self._data) // 8 + 2)
+        return self._read_words(0, len(self._data) // 8 + 2)
 
-    def _words(self, start: int, stop: int) -> np.ndarray:
+    def _read_words(self, start: int, stop: int) -> np.ndarray:
+        """Return the 64-bit words start to stop - 1; words beyond the data are 0."""
         data = bytes(self._data[8 * start : 8 * stop])
         return np.frombuffer(data.ljust(8 * (stop - start), b"\0"), "<u8").astype(np.uint64, copy=False)
 

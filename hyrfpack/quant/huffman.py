@@ -100,7 +100,7 @@ class HuffmanCode:
 
     @cached_property
     def left_aligned_codes(self) -> np.ndarray:
-        """Return the (n,) uint64 codes, each shifted so that its first bit is bit 63."""
+        """The codes, (n,) uint64, each shifted so that its first bit is bit 63."""
         shares = np.uint64(1) << (np.uint64(64) - self.lengths.astype(np.uint64))
         return np.cumsum(shares, dtype=np.uint64) - shares  # exact although the last sum, 2^64, wraps to 0
 
@@ -123,9 +123,9 @@ class HuffmanCode:
     def codes_by_symbol(self, size: int) -> tuple[np.ndarray, np.ndarray]:
         """Return left-aligned codes (uint64) and lengths (uint64, 0 = no code) of the symbols 0 to size - 1."""
         codes, lengths = np.zeros((2, size), np.uint64)
-        real = self.symbols != END_MARK
-        codes[self.symbols[real]] = self.left_aligned_codes[real]
-        lengths[self.symbols[real]] = self.lengths[real]
+        is_symbol = self.symbols != END_MARK
+        codes[self.symbols[is_symbol]] = self.left_aligned_codes[is_symbol]
+        lengths[self.symbols[is_symbol]] = self.lengths[is_symbol]
         return codes, lengths
 
 
@@ -149,15 +149,15 @@ class HuffmanStream:
 
     def to_bytes(self) -> bytes:
         """Serialise the stream; the docstring of this module describes the layout."""
-        symbols, width = self.code.symbols, self.dtype.itemsize
-        wide = 4 if self.chunk_bits.max(initial=0) > 0xFFFF else 2
+        symbols, symbol_bytes = self.code.symbols, self.dtype.itemsize
+        size_bytes = 4 if self.chunk_bits.max(initial=0) > 0xFFFF else 2
         end = int(np.argmax(symbols == END_MARK)) if len(symbols) else 0
         return b"".join(
             (
-                _HEADER_STRUCT.pack(self.count, len(self.payload), len(symbols), end, width, wide),
+                _HEADER_STRUCT.pack(self.count, len(self.payload), len(symbols), end, symbol_bytes, size_bytes),
                 self.code.lengths.tobytes(),
-                symbols[symbols != END_MARK].astype(f"<u{width}").tobytes(),
-                self.chunk_bits.astype(f"<u{wide}").tobytes(),
+                symbols[symbols != END_MARK].astype(f"<u{symbol_bytes}").tobytes(),
+                self.chunk_bits.astype(f"<u{size_bytes}").tobytes(),
                 self.payload,
             )
         )
@@ -171,15 +171,16 @@ class HuffmanStream:
         """
         if len(data) < _HEADER_STRUCT.size:
             raise DamagedDataError(f"Huffman stream: {len(data)} bytes are fewer than its header; it is truncated")
-        count, payload_size, leaves, end, width, wide = _HEADER_STRUCT.unpack_from(data)
-        if width not in (1, 2) or wide not in (2, 4) or leaves > 256**width + 1 or end > max(leaves - 1, 0):
+        count, payload_size, leaves, end, symbol_bytes, size_bytes = _HEADER_STRUCT.unpack_from(data)
+        has_valid_widths = symbol_bytes in (1, 2) and size_bytes in (2, 4)
+        if not has_valid_widths or leaves > 256**symbol_bytes + 1 or end > max(leaves - 1, 0):
             raise DamagedDataError("Huffman stream: its header has impossible values; the data is damaged")
         if count > 8 * payload_size or (count > 0) != (payload_size > 0) or (leaves == 0 and count > 0):
             raise DamagedDataError(
                 f"Huffman stream: {count} symbols cannot come from {payload_size} bytes; the data is damaged"
             )
         chunks = -(-count // chunk_length(count))
-        sizes = (leaves, max(leaves - 1, 0) * width, chunks * wide, payload_size)
+        sizes = (leaves, max(leaves - 1, 0) * symbol_bytes, chunks * size_bytes, payload_size)
         if len(data) != _HEADER_STRUCT.size + sum(sizes):
             raise DamagedDataError(
                 f"Huffman stream: {len(data)} bytes where {_HEADER_STRUCT.size + sum(sizes)} are announced; it is "
@@ -189,11 +190,11 @@ class HuffmanStream:
         lengths, symbols, chunk_bits, payload = (
             data[start:stop] for start, stop in zip(edges, edges[1:], strict=False)
         )
-        alphabet = np.frombuffer(symbols, f"<u{width}").astype(np.int32)
+        alphabet = np.frombuffer(symbols, f"<u{symbol_bytes}").astype(np.int32)
         code = HuffmanCode(np.insert(alphabet, end, END_MARK) if leaves else alphabet, np.frombuffer(lengths, np.uint8))
         code.check()
-        bits = np.frombuffer(chunk_bits, f"<u{wide}").astype(np.int64)
-        return cls(code, count, np.dtype(f"u{width}"), bits, bytes(payload))
+        bits = np.frombuffer(chunk_bits, f"<u{size_bytes}").astype(np.int64)
+        return cls(code, count, np.dtype(f"u{symbol_bytes}"), bits, bytes(payload))
 
 
 def huffman_encode(symbols: np.ndarray, code: HuffmanCode | None = None) -> HuffmanStream:
@@ -267,11 +268,10 @@ def _pack(keys: np.ndarray, table: np.ndarray, bits: int, interval: int) -> tupl
         position = int(starts[-1])
         starts -= lengths
         sampled.append(starts[-first % interval :: interval].copy())
-        offsets = starts & np.uint64(63)
-        places = starts >> np.uint64(6)
-        heads = np.append(0, np.flatnonzero(places[1:] != places[:-1]) + 1)
+        offsets, word_index = starts & np.uint64(63), starts >> np.uint64(6)
+        heads = np.append(0, np.flatnonzero(word_index[1:] != word_index[:-1]) + 1)
         tails = np.append(heads[1:], len(entries)) - 1
-        word, stop = int(places[0]), int(places[0]) + len(heads)
+        word, stop = int(word_index[0]), int(word_index[0]) + len(heads)
         words[word:stop] |= np.add.reduceat(entries >> offsets, heads)
         # Two shifts are used, because one shift by all 64 bits would be undefined.
         words[word + 1 : stop + 1] |= entries[tails] << np.uint64(1) << (np.uint64(63) - offsets[tails])
@@ -294,7 +294,7 @@ def huffman_decode(stream: HuffmanStream) -> np.ndarray:
     if (int(ends[-1]) + 7) // 8 != len(stream.payload):
         raise DamagedDataError("Huffman stream: its chunks do not add up to its length; the data is damaged")
     steps, lanes = min(interval, count), len(ends)
-    left_over = count - (lanes - 1) * interval  # The last chunk has this many symbols.
+    last_chunk_symbols = count - (lanes - 1) * interval
 
     halves = np.frombuffer(stream.payload + bytes(20 + -len(stream.payload) % 4), ">u4").astype(np.uint64)
     windows = halves[:-1] << np.uint64(32) | halves[1:]  # A window has the 64 bits from every 32nd bit on.
@@ -310,7 +310,7 @@ def huffman_decode(stream: HuffmanStream) -> np.ndarray:
     for first in range(0, steps, _STEPS_PER_BLOCK):
         rows = min(_STEPS_PER_BLOCK, steps - first)
         for row in range(rows):
-            if first + row == left_over:
+            if first + row == last_chunk_symbols:
                 last_end = int(position[-1])
             entry = entries[row]
             np.right_shift(position, np.uint64(5), out=index)

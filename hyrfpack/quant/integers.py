@@ -22,9 +22,9 @@ _VALUES_PER_BLOCK = 1 << 16  # Temporary arrays of this size stay in the caches.
 def _build_token_tables() -> tuple[np.ndarray, np.ndarray]:
     """Return the smallest value (uint64) and the number of extra bits (uint8) of each token."""
     exponents = np.append(np.repeat(np.arange(4, 7), 4), np.repeat(np.arange(7, 56), 2)).astype(np.int64)
-    kept = np.where(exponents < 7, 2, 1)  # The number of bits below the highest one that are part of the token.
-    leading = (1 << kept) + np.arange(len(exponents)) % (1 << kept)
-    extra = exponents - kept
+    token_bits = np.where(exponents < 7, 2, 1)  # bits below the highest one that are part of the token
+    leading = (1 << token_bits) + np.arange(len(exponents)) % (1 << token_bits)
+    extra = exponents - token_bits
     return np.append(np.arange(16), leading << extra).astype(np.uint64), np.append(np.zeros(16), extra).astype(np.uint8)
 
 
@@ -117,16 +117,16 @@ def _values_to_tokens(values: np.ndarray, signed: bool) -> tuple[np.ndarray, byt
     tokens = np.empty(len(values), np.uint8)
     extras, lengths = [np.zeros(0, np.uint64)], [np.zeros(0, np.uint8)]
     for first in range(0, len(values), _VALUES_PER_BLOCK):
-        part = values[first : first + _VALUES_PER_BLOCK].astype(np.int64)
+        block = values[first : first + _VALUES_PER_BLOCK].astype(np.int64)
         if signed:
-            part = part << 1 ^ part >> 63
-        token = _TOKEN_BY_SMALL_VALUE.take(part, mode="clip")
-        large = np.flatnonzero(part >= len(_TOKEN_BY_SMALL_VALUE))
-        token[large] = np.searchsorted(MIN_VALUE_BY_TOKEN, part[large].view(np.uint64), side="right") - 1
+            block = block << 1 ^ block >> 63
+        token = _TOKEN_BY_SMALL_VALUE.take(block, mode="clip")
+        large = np.flatnonzero(block >= len(_TOKEN_BY_SMALL_VALUE))
+        token[large] = np.searchsorted(MIN_VALUE_BY_TOKEN, block[large].view(np.uint64), side="right") - 1
         length = EXTRA_BITS_BY_TOKEN.take(token)
         extended = np.flatnonzero(length)
         tokens[first : first + _VALUES_PER_BLOCK] = token
-        extras.append(part[extended].view(np.uint64))
+        extras.append(block[extended].view(np.uint64))
         lengths.append(length[extended])
     return tokens, pack_bits(np.concatenate(extras), np.concatenate(lengths))
 
@@ -135,13 +135,13 @@ def _tokens_to_values(tokens: np.ndarray, reader: BitReader, signed: bool, value
     """Write the values of tokens and extra bits into `values` (M,) uint32 or uint64."""
     for first in range(0, len(tokens), _VALUES_PER_BLOCK):
         token = tokens[first : first + _VALUES_PER_BLOCK]
-        part, length = MIN_VALUE_BY_TOKEN.take(token), EXTRA_BITS_BY_TOKEN.take(token)
+        block, length = MIN_VALUE_BY_TOKEN.take(token), EXTRA_BITS_BY_TOKEN.take(token)
         extended = np.flatnonzero(length)
-        part[extended] += reader.read(length[extended])
+        block[extended] += reader.read(length[extended])
         if signed:
-            part = part >> np.uint64(1) ^ np.uint64(0) - (part & np.uint64(1))
+            block = block >> np.uint64(1) ^ np.uint64(0) - (block & np.uint64(1))
         # Truncation keeps negative numbers: the lower half of an int64 in two's complement is the same number in int32.
-        values[first : first + _VALUES_PER_BLOCK] = part.astype(values.dtype)
+        values[first : first + _VALUES_PER_BLOCK] = block.astype(values.dtype)
 
 
 def _values_to_tokens_compiled(values: np.ndarray, signed: bool) -> tuple[np.ndarray, bytes]:
@@ -149,21 +149,23 @@ def _values_to_tokens_compiled(values: np.ndarray, signed: bool) -> tuple[np.nda
     from hyrfpack.quant import integers_kernels
 
     tokens, extra = np.empty(len(values), np.uint8), bytearray()
-    words, place = np.zeros(_VALUES_PER_BLOCK + 2, np.uint64), 0
+    words, position = np.zeros(_VALUES_PER_BLOCK + 2, np.uint64), 0
     for first in range(0, len(values), _VALUES_PER_BLOCK):
-        part = values[first : first + _VALUES_PER_BLOCK].astype(np.int64)
+        block = values[first : first + _VALUES_PER_BLOCK].astype(np.int64)
         token = tokens[first : first + _VALUES_PER_BLOCK]
         tables = _TOKEN_BY_SMALL_VALUE, EXTRA_BITS_BY_TOKEN
-        end = int(integers_kernels.values_to_tokens(part, signed, *tables, token, words, place))
+        end = int(integers_kernels.values_to_tokens(block, signed, *tables, token, words, position))
         extra += words[: end // 64].astype("<u8").tobytes()
         words[0] = words[end // 64]
         words[1 : end // 64 + 2] = 0
-        place = end % 64
-    return tokens, bytes(extra) + words[:1].astype("<u8").tobytes()[: (place + 7) // 8]
+        position = end % 64
+    return tokens, bytes(extra) + words[:1].astype("<u8").tobytes()[: (position + 7) // 8]
 
 
 def _tokens_to_values_compiled(tokens: np.ndarray, reader: BitReader, signed: bool, values: np.ndarray) -> None:
     """Write the same values as `_tokens_to_values`, by Numba."""
     from hyrfpack.quant import integers_kernels
 
-    integers_kernels.tokens_to_values(tokens, reader.words(), signed, MIN_VALUE_BY_TOKEN, EXTRA_BITS_BY_TOKEN, values)
+    integers_kernels.tokens_to_values(
+        tokens, reader.read_all_words(), signed, MIN_VALUE_BY_TOKEN, EXTRA_BITS_BY_TOKEN, values
+    )

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 MAX_WEIGHT_SIXTEENTHS = 16
-_PLACES_PER_BLOCK = 1 << 14  # Temporary arrays of this size stay in the caches.
+_NUMBERS_PER_BLOCK = 1 << 14  # Temporary arrays of this size stay in the caches.
 
 
 def iter_levels(count: int) -> Iterator[tuple[np.ndarray, int]]:
@@ -27,16 +27,16 @@ def iter_levels(count: int) -> Iterator[tuple[np.ndarray, int]]:
     distance = 1 << max(count - 1, 0).bit_length()
     while distance > 1:
         distance //= 2
-        for first in range(distance, count, 2 * distance * _PLACES_PER_BLOCK):
-            yield np.arange(first, min(first + 2 * distance * _PLACES_PER_BLOCK, count), 2 * distance), distance
+        for first in range(distance, count, 2 * distance * _NUMBERS_PER_BLOCK):
+            yield np.arange(first, min(first + 2 * distance * _NUMBERS_PER_BLOCK, count), 2 * distance), distance
 
 
-def predict(values: np.ndarray, places: np.ndarray, distance: int, weight: int) -> np.ndarray:
-    """Predict the numbers at `places` from numbers that have been decoded.
+def predict(values: np.ndarray, indices: np.ndarray, distance: int, weight: int) -> np.ndarray:
+    """Predict the numbers at `indices` from neighbours that have been decoded.
 
     Args:
         values: (N,) int64 decoded numbers.
-        places: (n,) indices from `iter_levels`, 2 d apart.
+        indices: (n,) from `iter_levels`, 2 d apart.
         distance: d.
         weight: weight of the prediction in 16ths, 0 to MAX_WEIGHT_SIXTEENTHS.
 
@@ -44,12 +44,12 @@ def predict(values: np.ndarray, places: np.ndarray, distance: int, weight: int) 
         (n,) int64.
     """
     if weight == 0:
-        return np.zeros(len(places), np.int64)
-    neighbours = values[places[0] - distance : places[-1] + distance + 1 : 2 * distance]
-    prediction = neighbours[: len(places)].copy()
-    after = neighbours[1:]
-    prediction[: len(after)] += after
-    prediction[len(after) :] *= 2  # the last number has no neighbour after it
+        return np.zeros(len(indices), np.int64)
+    neighbours = values[indices[0] - distance : indices[-1] + distance + 1 : 2 * distance]
+    prediction = neighbours[: len(indices)].copy()
+    later_neighbours = neighbours[1:]
+    prediction[: len(later_neighbours)] += later_neighbours
+    prediction[len(later_neighbours) :] *= 2  # the last number has no neighbour after it
     prediction *= weight
     prediction >>= 5
     return prediction
@@ -71,10 +71,10 @@ def lift(
     """
     residuals, values = np.zeros((2, count), np.int64)
     first = np.arange(min(count, 1))
-    for places, distance in [(first, 0), *iter_levels(count)]:
-        prediction = predict(values, places, distance, weight) if distance else np.zeros(len(places), np.int64)
-        residuals[places] = choose(places, prediction)
-        values[places] = prediction + residuals[places] * steps[places]
+    for indices, distance in [(first, 0), *iter_levels(count)]:
+        prediction = predict(values, indices, distance, weight) if distance else np.zeros(len(indices), np.int64)
+        residuals[indices] = choose(indices, prediction)
+        values[indices] = prediction + residuals[indices] * steps[indices]
     return residuals, values
 
 
@@ -82,6 +82,6 @@ def inverse_lift(residuals: np.ndarray, weight: int, steps: np.ndarray) -> np.nd
     """Return the numbers (N,) int64 from differences (N,), in units of steps (N,) int64."""
     values = np.multiply(residuals, steps, dtype=np.int64)
     if weight:
-        for places, distance in iter_levels(len(values)):
-            values[places[0] : places[-1] + 1 : 2 * distance] += predict(values, places, distance, weight)
+        for indices, distance in iter_levels(len(values)):
+            values[indices[0] : indices[-1] + 1 : 2 * distance] += predict(values, indices, distance, weight)
     return values

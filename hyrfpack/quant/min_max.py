@@ -82,22 +82,22 @@ class MinMaxQuantizer:
         Raises:
             ValueError: a value is not finite as float32.
         """
-        work = np.array(values, np.float64)  # copied, because it is changed in place
+        levels = np.array(values, np.float64)  # copied, because it is changed in place
         with np.errstate(over="ignore"):
-            minimum, maximum = (float(np.float32(f(work))) if work.size else 0.0 for f in (np.min, np.max))
+            minimum, maximum = (float(np.float32(f(levels))) if levels.size else 0.0 for f in (np.min, np.max))
         if not (math.isfinite(minimum) and math.isfinite(maximum)):
             raise ValueError("min-max quantisation: a value is NaN or beyond float32; only finite values can be coded")
-        last = 2**self.bits - 1
+        max_code = 2**self.bits - 1
         if maximum > minimum:
-            work -= minimum
-            work *= last
-            work /= maximum - minimum
-            np.rint(work, out=work)
+            levels -= minimum
+            levels *= max_code
+            levels /= maximum - minimum
+            np.rint(levels, out=levels)
             # float64 values may lie a little outside a range rounded to float32.
-            np.clip(work, 0, last, out=work)
+            np.clip(levels, 0, max_code, out=levels)
         else:
-            work[...] = 0
-        return work.astype(np.uint8 if self.bits <= 8 else np.uint16), MinMaxParams(minimum, maximum, self.bits)
+            levels[...] = 0
+        return levels.astype(np.uint8 if self.bits <= 8 else np.uint16), MinMaxParams(minimum, maximum, self.bits)
 
     @staticmethod
     def decode(codes: np.ndarray, params: MinMaxParams) -> np.ndarray:
@@ -113,9 +113,11 @@ class MinMaxQuantizer:
         Raises:
             DamagedDataError: a code is 2^b or more.
         """
-        last = 2**params.bits - 1
-        if codes.max(initial=0) > last:
-            raise DamagedDataError(f"min-max codes: {codes.max()} is more than {params.bits} bits; the data is damaged")
-        levels = np.arange(last + 1)
+        max_code = 2**params.bits - 1
+        if codes.max(initial=0) > max_code:
+            raise DamagedDataError(
+                f"min-max codes: {codes.max()} has more than {params.bits} bits; the data is damaged"
+            )
+        levels = np.arange(max_code + 1)
         # Both products are exact in float64. So the ends of the range are exact, even if they are far apart.
-        return (((last - levels) * params.minimum + levels * params.maximum) / last).astype(np.float32)[codes]
+        return (((max_code - levels) * params.minimum + levels * params.maximum) / max_code).astype(np.float32)[codes]

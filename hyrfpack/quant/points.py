@@ -83,13 +83,13 @@ def sort_points(points: LatticePoints, *, keep_bits: bool = False) -> tuple[np.n
 def encode_sorted_points(points: LatticePoints, base: int) -> bytes:
     """Encode points that `sort_points` has sorted by `base` bits of each axis."""
     classes, bits = points.classes, points.bits
-    finer = (3 * (bits - base)).astype(np.uint8)[classes]
+    finer_bits = (3 * (bits - base)).astype(np.uint8)[classes]
     codes = morton_codes(points.cells)
-    gaps = np.diff(codes >> finer, prepend=0)
+    gaps = np.diff(codes >> finer_bits, prepend=0)
     gap_bytes = encode_integers(gaps)
     class_bytes = encode_integers(classes, (gaps == 0).view(np.uint8))
     header = _HEADER_STRUCT.pack(base, len(bits), len(gap_bytes), len(class_bytes)) + bits.astype(np.uint8).tobytes()
-    tail_bytes = pack_bits(codes.view(np.uint64), finer)
+    tail_bytes = pack_bits(codes.view(np.uint64), finer_bits)
     return b"".join((header, gap_bytes, class_bytes, tail_bytes))
 
 
@@ -101,14 +101,14 @@ def decode_points(data: bytes | memoryview, count: int) -> LatticePoints:
     """
     if len(data) < _HEADER_STRUCT.size:
         raise DamagedDataError(f"points: {len(data)} bytes are fewer than their header; the data is truncated")
-    base, kinds, gap_size, class_size = _HEADER_STRUCT.unpack_from(data)
-    start = _HEADER_STRUCT.size + kinds
-    is_in_range = 1 <= kinds <= MAX_POINT_CLASSES and 1 <= base <= MAX_BITS_PER_AXIS
+    base, class_count, gap_size, class_size = _HEADER_STRUCT.unpack_from(data)
+    start = _HEADER_STRUCT.size + class_count
+    is_in_range = 1 <= class_count <= MAX_POINT_CLASSES and 1 <= base <= MAX_BITS_PER_AXIS
     if not is_in_range or start + gap_size + class_size > len(data):
         raise DamagedDataError("points: the header has impossible values; the data is damaged")
     bits = np.frombuffer(data[_HEADER_STRUCT.size : start], np.uint8).astype(np.int64)
     if bits.min() < base or bits.max() > MAX_BITS_PER_AXIS:
-        raise DamagedDataError("points: a class has fewer bits than all share, or too many; the data is damaged")
+        raise DamagedDataError("points: a class has fewer bits than the base, or too many; the data is damaged")
     gaps = decode_integers(data[start : start + gap_size], count)
     repeated = (gaps == 0).view(np.uint8)
     heads = np.cumsum(gaps, dtype=np.int64)
@@ -116,12 +116,14 @@ def decode_points(data: bytes | memoryview, count: int) -> LatticePoints:
         raise DamagedDataError("points: the gaps lead out of the lattice; the data is damaged")
     del gaps
     classes = decode_integers(data[start + gap_size : start + gap_size + class_size], count, repeated)
-    if count and int(classes.max()) >= kinds:
-        raise DamagedDataError(f"points: class {classes.max()} of {kinds}; the data is damaged")
+    if count and int(classes.max()) >= class_count:
+        raise DamagedDataError(
+            f"points: there is a class {classes.max()}, but only {class_count} are declared; the data is damaged"
+        )
     classes = classes.astype(np.uint8)
-    finer = (3 * (bits - base)).astype(np.uint8)[classes]
-    tails = unpack_bits(data[start + gap_size + class_size :], finer)
-    heads <<= finer
+    finer_bits = (3 * (bits - base)).astype(np.uint8)[classes]
+    tails = unpack_bits(data[start + gap_size + class_size :], finer_bits)
+    heads <<= finer_bits
     heads |= tails.view(np.int64)
     return LatticePoints(morton_cells(heads), classes, bits)
 
@@ -136,7 +138,7 @@ def _choose_base_bits(codes: np.ndarray, classes: np.ndarray, bits: np.ndarray, 
     if len(codes) == 0:
         return 1
     population = np.bincount(classes, minlength=len(bits))
-    best, least = 1, np.inf
+    best_base, min_cost = 1, np.inf
     for base in range(max(1, min(int(np.log2(len(codes)) / 3) - 1, largest)), largest + 1):
         lengths = np.frexp(np.diff(codes >> 3 * (finest - base), prepend=0).astype(np.float64))[1]
         histogram = np.bincount(lengths)
@@ -144,6 +146,6 @@ def _choose_base_bits(codes: np.ndarray, classes: np.ndarray, bits: np.ndarray, 
         # A gap of n bits costs its token, about the entropy of n, and the n - 1 bits below the highest.
         cost = len(codes) * -(share * np.log2(share)).sum() + np.maximum(lengths - 1, 0).sum()
         cost += 3 * (np.maximum(bits - base, 0) * population).sum()
-        if cost < least:
-            best, least = base, cost
-    return best
+        if cost < min_cost:
+            best_base, min_cost = base, cost
+    return best_base

@@ -84,10 +84,10 @@ def encode_tokens(tokens: np.ndarray, contexts: np.ndarray | None = None, implem
         [0, 0, 1, 0, 2]
     """
     backend = _select_backend(implementation)
-    contexts, classes_of_context = _check_contexts(contexts, len(tokens))
+    contexts, context_count = _check_contexts(contexts, len(tokens))
     if tokens.ndim != 1 or tokens.dtype != np.uint8 or tokens.max(initial=0) >= MAX_ALPHABET_SIZE:
         raise ValueError(f"tokens must be (M,) uint8 below {MAX_ALPHABET_SIZE}, got {tokens.shape} {tokens.dtype}")
-    return _encode(np.ascontiguousarray(tokens), contexts, classes_of_context, backend, static=True)
+    return _encode(np.ascontiguousarray(tokens), contexts, context_count, backend, allow_static=True)
 
 
 def decode_tokens(
@@ -108,7 +108,7 @@ def decode_tokens(
     if count < 0:
         raise ValueError(f"count must be 0 or more, got {count}")
     contexts, context_count = _check_contexts(contexts, count)
-    return _decode(memoryview(data), count, contexts, context_count, _select_backend(implementation), static=True)
+    return _decode(memoryview(data), count, contexts, context_count, _select_backend(implementation), allow_static=True)
 
 
 def uses_numba(implementation: str) -> bool:
@@ -142,27 +142,27 @@ def _check_contexts(contexts: np.ndarray | None, count: int) -> tuple[np.ndarray
 
 
 def _encode(
-    tokens: np.ndarray, contexts: np.ndarray | None, context_count: int, backend: ModuleType, static: bool
+    tokens: np.ndarray, contexts: np.ndarray | None, context_count: int, backend: ModuleType, allow_static: bool
 ) -> bytes:
-    """Encode tokens that have been checked; static models are considered only if `static`."""
+    """Encode tokens that have been checked; static models are considered only if `allow_static`."""
     if len(tokens) == 0:
         return b""
     alphabet = int(tokens.max()) + 1
-    most_classes = min(
+    max_classes = min(
         MAX_TOKEN_CLASSES, MAX_MODELS // context_count, len(tokens) // (context_count * _MIN_TOKENS_PER_MODEL)
     )
-    if most_classes > 1:
+    if max_classes > 1:
         pairs = backend.count_pairs(tokens, contexts, context_count, alphabet)
     else:
         one_lane, one_class = LaneLayout(len(tokens), 1), _make_selector(contexts, (), alphabet)
         shape = (context_count, alphabet)
         pairs = backend.count_tokens(tokens, one_class, one_lane, 0, len(tokens), shape)[:, None]
-    alone = pairs.sum(axis=1)
-    if ((alone > 0).sum(axis=1) <= 1).all():
-        return bytes((0, 0)) + alone.argmax(axis=1).astype(np.uint8).tobytes()
+    context_counts = pairs.sum(axis=1)
+    if ((context_counts > 0).sum(axis=1) <= 1).all():
+        return bytes((0, 0)) + context_counts.argmax(axis=1).astype(np.uint8).tobytes()
     plans = [
-        _make_plan(tokens, contexts, context_count, alphabet, thresholds, bits, backend, static)
-        for thresholds, bits in _candidate_thresholds(pairs, most_classes)
+        _make_plan(tokens, contexts, context_count, alphabet, thresholds, bits, backend, allow_static)
+        for thresholds, bits in _candidate_thresholds(pairs, max_classes)
     ]
     return min(plans, key=lambda plan: plan.cost).encode(tokens, backend)
 
@@ -173,14 +173,14 @@ class _CodingPlan:
 
     Attributes:
         cost: size of tokens and models, in 2^-16 bits.
-        head: bytes before the states.
+        header: bytes before the states.
         selector: selects the model of each token.
         lanes: assignment of tokens to lanes.
         segments: ranges (start, stop) of steps with their frequencies.
     """
 
     cost: int
-    head: bytes
+    header: bytes
     selector: ModelSelector
     lanes: LaneLayout
     segments: list[tuple[int, int, np.ndarray]]
@@ -188,7 +188,7 @@ class _CodingPlan:
     def encode(self, tokens: np.ndarray, backend: ModuleType) -> bytes:
         """Return the stream of the tokens."""
         states, words = backend.encode_lanes(tokens, self.selector, self.lanes, self.segments)
-        return b"".join((self.head, states.astype("<u4").tobytes(), words.astype("<u2").tobytes()))
+        return b"".join((self.header, states.astype("<u4").tobytes(), words.astype("<u2").tobytes()))
 
 
 def _make_plan(
@@ -199,51 +199,57 @@ def _make_plan(
     thresholds: tuple[int, ...],
     bits: int,
     backend: ModuleType,
-    static: bool,
+    allow_static: bool,
 ) -> _CodingPlan:
-    """Choose static or adaptive models for the classes of `thresholds`; `bits` is the estimated size of the tokens."""
+    """Choose adaptive models, or static ones if allowed, for the classes of `thresholds`.
+
+    `bits` is the estimated size of the tokens.
+    """
     lanes_log2 = _choose_lanes_log2(len(tokens), bits)
     lanes, selector = LaneLayout(len(tokens), 1 << lanes_log2), _make_selector(contexts, thresholds, alphabet)
     shape = (context_count * selector.classes, alphabet)
-    first = lanes_log2 | len(thresholds) << 4
+    first_byte = lanes_log2 | len(thresholds) << 4
 
     ranges = list(iter_update_ranges(lanes.steps))
-    new = np.stack([backend.count_tokens(tokens, selector, lanes, start, stop, shape) for start, stop in ranges])
-    counts = new.sum(axis=0)
-    frequencies = adaptive_frequencies(np.cumsum(new, axis=0) - new)  # from the counts before each range
-    cost = int((new * COST_BY_FREQUENCY[frequencies]).sum())
+    range_counts = np.stack(
+        [backend.count_tokens(tokens, selector, lanes, start, stop, shape) for start, stop in ranges]
+    )
+    counts = range_counts.sum(axis=0)
+    counts_before = np.cumsum(range_counts, axis=0) - range_counts
+    frequencies = adaptive_frequencies(counts_before)
+    cost = int((range_counts * COST_BY_FREQUENCY[frequencies]).sum())
     segments = [(*steps, rows) for steps, rows in zip(ranges, frequencies, strict=True)]
-    adaptive = _CodingPlan(cost, bytes((first, alphabet, *thresholds)), selector, lanes, segments)
-    if not static:
+    adaptive = _CodingPlan(cost, bytes((first_byte, alphabet, *thresholds)), selector, lanes, segments)
+    if not allow_static:
         return adaptive
 
     levels = static_levels(counts)
-    table, frequencies = _encode_levels(levels, backend), static_frequencies(levels)
-    cost = int((counts * COST_BY_FREQUENCY[frequencies]).sum()) + (8 * len(table) << 16)
+    level_bytes, frequencies = _encode_levels(levels, backend), static_frequencies(levels)
+    cost = int((counts * COST_BY_FREQUENCY[frequencies]).sum()) + (8 * len(level_bytes) << 16)
     if cost >= adaptive.cost:
         return adaptive
-    head = bytes((first | _STATIC_FLAG, alphabet, *thresholds)) + table
-    return _CodingPlan(cost, head, selector, lanes, [(0, lanes.steps, frequencies)])
+    header = bytes((first_byte | _STATIC_FLAG, alphabet, *thresholds)) + level_bytes
+    return _CodingPlan(cost, header, selector, lanes, [(0, lanes.steps, frequencies)])
 
 
 def _make_selector(contexts: np.ndarray | None, thresholds: Sequence[int], alphabet: int) -> ModelSelector:
     """Build the selector for token classes that begin at the given thresholds."""
-    class_of = np.searchsorted(thresholds, np.arange(alphabet), side="right").astype(np.uint8)
-    return ModelSelector(contexts, class_of, len(thresholds) + 1)
+    class_by_token = np.searchsorted(thresholds, np.arange(alphabet), side="right").astype(np.uint8)
+    return ModelSelector(contexts, class_by_token, len(thresholds) + 1)
 
 
-def _candidate_thresholds(pairs: np.ndarray, most_classes: int) -> list[tuple[tuple[int, ...], int]]:
+def _candidate_thresholds(pairs: np.ndarray, max_classes: int) -> list[tuple[tuple[int, ...], int]]:
     """Return the class thresholds to try, each with the estimated size in bits.
 
     These are the empty thresholds, which make one class, and the thresholds with the smallest estimate.
 
     Args:
         pairs: (contexts, previous token, token) number of occurrences of each pair.
-        most_classes: largest allowed number of classes.
+        max_classes: largest allowed number of classes.
     """
     choices: dict[tuple[int, ...], int] = {(): _estimate_bits(pairs.sum(axis=1))}
     pooled = np.cumsum(pairs.sum(axis=(0, 1)))
-    for classes in range(2, most_classes + 1):
+    for classes in range(2, max_classes + 1):
         # Each class gets about the same number of tokens.
         edges = np.searchsorted(pooled, pooled[-1] * np.arange(1, classes) // classes, side="right")
         thresholds = tuple(np.unique(np.clip(edges, 1, len(pooled) - 1)).tolist())
@@ -263,8 +269,8 @@ def _estimate_bits(counts: np.ndarray) -> int:
 
 def _choose_lanes_log2(count: int, bits: float) -> int:
     """Return log2 of the number of lanes, so that lanes take few extra bytes and none is too long."""
-    wanted = max(int(bits) // (8 * _TARGET_BYTES_PER_LANE), count // (_MAX_STEPS_PER_LANE // 2), 1)
-    return min(wanted, MAX_LANES).bit_length() - 1
+    lanes = max(int(bits) // (8 * _TARGET_BYTES_PER_LANE), count // (_MAX_STEPS_PER_LANE // 2), 1)
+    return min(lanes, MAX_LANES).bit_length() - 1
 
 
 def _encode_levels(levels: np.ndarray, backend: ModuleType) -> bytes:
@@ -275,12 +281,12 @@ def _encode_levels(levels: np.ndarray, backend: ModuleType) -> bytes:
     differences = np.diff(levels, axis=0, prepend=0)
     differences[0] = np.diff(levels[0], prepend=0)
     zigzag = np.where(differences < 0, -2 * differences - 1, 2 * differences)
-    return _encode(zigzag.astype(np.uint8).ravel(), None, 1, backend, static=False)
+    return _encode(zigzag.astype(np.uint8).ravel(), None, 1, backend, allow_static=False)
 
 
 def _decode_levels(data: memoryview, models: int, alphabet: int, backend: ModuleType) -> tuple[np.ndarray, int]:
     """Decode the levels (models, alphabet) of static models; return them and the length of their stream in bytes."""
-    decoded = _decode(data, models * alphabet, None, 1, backend, static=False)
+    decoded = _decode(data, models * alphabet, None, 1, backend, allow_static=False)
     zigzag = decoded.tokens.astype(np.int64).reshape(models, alphabet)
     levels = np.where(zigzag & 1, -(zigzag + 1 >> 1), zigzag >> 1)
     levels[0] = np.cumsum(levels[0])
@@ -291,9 +297,14 @@ def _decode_levels(data: memoryview, models: int, alphabet: int, backend: Module
 
 
 def _decode(
-    data: memoryview, count: int, contexts: np.ndarray | None, context_count: int, backend: ModuleType, static: bool
+    data: memoryview,
+    count: int,
+    contexts: np.ndarray | None,
+    context_count: int,
+    backend: ModuleType,
+    allow_static: bool,
 ) -> DecodedTokens:
-    """Decode tokens with checked arguments; static models are rejected unless `static`."""
+    """Decode tokens with checked arguments; static models are rejected unless `allow_static`."""
     if count == 0:
         return DecodedTokens(np.zeros(0, np.uint8), 0, 0)
     if len(data) < _HEADER_BYTES:
@@ -303,24 +314,29 @@ def _decode(
     if alphabet == 0:
         return _decode_constants(data, count, contexts, context_count)
     models = context_count * classes
-    if alphabet > MAX_ALPHABET_SIZE or models > MAX_MODELS or 1 << lanes_log2 > MAX_LANES or (is_static and not static):
+    if (
+        alphabet > MAX_ALPHABET_SIZE
+        or models > MAX_MODELS
+        or 1 << lanes_log2 > MAX_LANES
+        or (is_static and not allow_static)
+    ):
         raise DamagedDataError("rANS stream: its header has impossible values; the data is damaged")
     if count > _MAX_STEPS_PER_LANE << lanes_log2 and 1 << lanes_log2 < MAX_LANES:
         raise DamagedDataError(f"rANS stream: too few lanes for {count} symbols; the data is damaged")
-    place = _HEADER_BYTES + classes - 1
-    thresholds = list(data[_HEADER_BYTES:place])
+    position = _HEADER_BYTES + classes - 1
+    thresholds = list(data[_HEADER_BYTES:position])
     if any(low >= high for low, high in zip([0, *thresholds], [*thresholds, alphabet], strict=True)):
         raise DamagedDataError("rANS stream: the thresholds of its classes do not rise; the data is damaged")
 
     lanes = LaneLayout(count, 1 << lanes_log2)
     if is_static:
-        levels, size = _decode_levels(data[place:], models, alphabet, backend)
-        place += size
-    if len(data) < place + 4 * lanes.used_lanes:
+        levels, size = _decode_levels(data[position:], models, alphabet, backend)
+        position += size
+    if len(data) < position + 4 * lanes.used_lanes:
         raise DamagedDataError(f"rANS stream: {len(data)} bytes are fewer than its lanes need; it is truncated")
-    states = np.frombuffer(data, "<u4", lanes.used_lanes, place).astype(np.uint32)
-    place += 4 * lanes.used_lanes
-    words = np.frombuffer(data, "<u2", (len(data) - place) // 2, place).astype(np.uint16)
+    states = np.frombuffer(data, "<u4", lanes.used_lanes, position).astype(np.uint32)
+    position += 4 * lanes.used_lanes
+    words = np.frombuffer(data, "<u2", (len(data) - position) // 2, position).astype(np.uint16)
 
     selector = _make_selector(contexts, thresholds, alphabet)
     decoder = backend.LaneDecoder(selector, lanes, states, words)
@@ -333,14 +349,14 @@ def _decode(
             decoder.run(start, stop, adaptive_frequencies(counts))
             if stop < lanes.steps:
                 counts += backend.count_tokens(decoder.tokens, selector, lanes, start, stop, shape)
-    return DecodedTokens(decoder.tokens, place + 2 * decoder.finish(), alphabet)
+    return DecodedTokens(decoder.tokens, position + 2 * decoder.finish(), alphabet)
 
 
 def _decode_constants(data: memoryview, count: int, contexts: np.ndarray | None, context_count: int) -> DecodedTokens:
     """Decode a stream in which each context has only one token."""
     stop = _HEADER_BYTES + context_count
-    token_of = np.frombuffer(data[_HEADER_BYTES:stop], np.uint8)
-    if data[0] != 0 or len(token_of) < context_count or token_of.max() >= MAX_ALPHABET_SIZE:
+    token_by_context = np.frombuffer(data[_HEADER_BYTES:stop], np.uint8)
+    if data[0] != 0 or len(token_by_context) < context_count or token_by_context.max() >= MAX_ALPHABET_SIZE:
         raise DamagedDataError("rANS stream: the tokens of its contexts are missing or damaged")
-    tokens = np.full(count, token_of[0]) if contexts is None else token_of.take(contexts)
-    return DecodedTokens(tokens, stop, int(token_of.max()) + 1)
+    tokens = np.full(count, token_by_context[0]) if contexts is None else token_by_context.take(contexts)
+    return DecodedTokens(tokens, stop, int(token_by_context.max()) + 1)

@@ -51,15 +51,15 @@ def encode_lanes(
     """Encode all tokens; see `rans_lanes.encode_lanes`."""
     states = np.full(lanes.used_lanes, START_STATE, np.uint32)
     words = np.empty(lanes.count, np.uint16)  # Each token emits at most one word. Unused pages take no memory.
-    place = lanes.count
+    position = lanes.count
     for start, stop, frequencies in reversed(segments):
         bases = np.cumsum(frequencies, axis=1) - frequencies
         packed = (frequencies << SCALE_BITS | bases).astype(np.uint32)
-        place = _encode(
-            tokens, *_selection(selector), states, words, place, packed, start, stop,
+        position = _encode(
+            tokens, *_selection(selector), states, words, position, packed, start, stop,
             lanes.steps, lanes.used_lanes, lanes.last_lane_steps,
         )  # fmt: skip
-    return states, words[place:]
+    return states, words[position:]
 
 
 class LaneDecoder(rans_lanes.LaneDecoder):
@@ -71,28 +71,28 @@ class LaneDecoder(rans_lanes.LaneDecoder):
 
     def run(self, start: int, stop: int, frequencies: np.ndarray) -> None:
         lanes, table = self._lanes, _decoding_table(frequencies)
-        self._place = _decode(
-            self.tokens, *_selection(self._selector), self._states, self._words, self._place, table, start, stop,
+        self._position = _decode(
+            self.tokens, *_selection(self._selector), self._states, self._words, self._position, table, start, stop,
             lanes.steps, lanes.used_lanes, lanes.last_lane_steps,
         )  # fmt: skip
-        if self._place > len(self._words) - lanes.used_lanes:
+        if self._position > len(self._words) - lanes.used_lanes:
             raise DamagedDataError("rANS stream: it ends before its last symbol; it is truncated")
 
 
 def _selection(selector: ModelSelector) -> tuple[np.ndarray, np.ndarray, int]:
     """Return contexts, class of each token and number of classes, as the kernels take them."""
-    return _NO_CONTEXTS if selector.contexts is None else selector.contexts, selector.class_of, selector.classes
+    return _NO_CONTEXTS if selector.contexts is None else selector.contexts, selector.class_by_token, selector.classes
 
 
 @njit
-def _count_tokens(counts, tokens, contexts, class_of, classes, start, stop, steps, used, last):
+def _count_tokens(counts, tokens, contexts, class_by_token, classes, start, stop, steps, used_lanes, last_lane_steps):
     has_contexts, has_classes = len(contexts) > 0, classes > 1
-    for lane in range(used):
-        for step in range(start, min(stop, last if lane == used - 1 else steps)):
+    for lane in range(used_lanes):
+        for step in range(start, min(stop, last_lane_steps if lane == used_lanes - 1 else steps)):
             i = np.uint64(lane * steps + step)
             model = np.uint64(contexts[i]) * np.uint64(classes) if has_contexts else _ZERO
             if has_classes and step > 0:
-                model += np.uint64(class_of[np.uint64(tokens[i - _ONE])])
+                model += np.uint64(class_by_token[np.uint64(tokens[i - _ONE])])
             counts[model, np.uint64(tokens[i])] += 1
 
 
@@ -108,44 +108,50 @@ def _count_pairs(counts, tokens, contexts):
 
 
 @njit
-def _encode(tokens, contexts, class_of, classes, states, words, place, packed, start, stop, steps, used, last):
+def _encode(
+    tokens, contexts, class_by_token, classes, states, words,
+    position, packed, start, stop, steps, used_lanes, last_lane_steps,
+):  # fmt: skip
     has_contexts, has_classes = len(contexts) > 0, classes > 1
     for step in range(stop - 1, start - 1, -1):
-        for lane in range(used - (step >= last) - 1, -1, -1):
+        for lane in range(used_lanes - (step >= last_lane_steps) - 1, -1, -1):
             i = np.uint64(lane * steps + step)
             model = np.uint64(contexts[i]) * np.uint64(classes) if has_contexts else _ZERO
             if has_classes and step > 0:
-                model += np.uint64(class_of[np.uint64(tokens[i - _ONE])])
+                model += np.uint64(class_by_token[np.uint64(tokens[i - _ONE])])
             entry = packed[model, np.uint64(tokens[i])]
             x, f = states[np.uint64(lane)], entry >> _SCALE_BITS
             if x >> _FLUSH_SHIFT >= f:
-                place -= 1
-                words[np.uint64(place)] = np.uint16(x)
+                position -= 1
+                words[np.uint64(position)] = np.uint16(x)
                 x >>= _WORD_BITS
             states[np.uint64(lane)] = x + x // f * (_FREQUENCY_TOTAL - f) + (entry & _OFFSET_MASK)
-    return place
+    return position
 
 
 @njit
-def _decode(tokens, contexts, class_of, classes, states, words, place, table, start, stop, steps, used, last):
+def _decode(
+    tokens, contexts, class_by_token, classes, states, words,
+    position, table, start, stop, steps, used_lanes, last_lane_steps,
+):  # fmt: skip
     has_contexts, has_classes = len(contexts) > 0, classes > 1
-    end, place = np.uint64(len(words) - used), np.uint64(place)
+    end, position = np.uint64(len(words) - used_lanes), np.uint64(position)
     for step in range(start, stop):
-        for lane in range(used - (step >= last)):
+        for lane in range(used_lanes - (step >= last_lane_steps)):
             i = np.uint64(lane) * np.uint64(steps) + np.uint64(step)
             model = np.uint64(contexts[i]) * np.uint64(classes) if has_contexts else _ZERO
             if has_classes and step > 0:
-                model += np.uint64(class_of[np.uint64(tokens[i - _ONE])])
+                model += np.uint64(class_by_token[np.uint64(tokens[i - _ONE])])
             x = states[np.uint64(lane)]
             entry = table[model, np.uint64(x & _OFFSET_MASK)]
             x = (x >> _SCALE_BITS) * (entry >> _SCALE_BITS & _FREQUENCY_MASK) + (entry & _OFFSET_MASK)
             tokens[i] = np.uint8(entry >> _TOKEN_SHIFT)
-            low, word = x < _START_STATE, np.uint32(words[place])
+            low, word = x < _START_STATE, np.uint32(words[position])
             states[np.uint64(lane)] = x << _WORD_BITS | word if low else x
-            place += np.uint64(low)
-        if place > end:
+            position += np.uint64(low)
+        if position > end:
             break
-    return np.int64(place)
+    return np.int64(position)
 
 
 @njit
@@ -154,11 +160,11 @@ def _decoding_table(frequencies):
     models, tokens = frequencies.shape
     table = np.empty((models, FREQUENCY_TOTAL), np.uint32)
     for model in range(models):
-        place = _ZERO
+        position = _ZERO
         for token in range(tokens):
             f = np.uint32(frequencies[model, token])
             entry = np.uint32(token) << _TOKEN_SHIFT | f << _SCALE_BITS
             for offset in range(f):
-                table[model, place] = entry | np.uint32(offset)
-                place += _ONE
+                table[model, position] = entry | np.uint32(offset)
+                position += _ONE
     return table

@@ -68,12 +68,12 @@ class ModelSelector:
 
     Attributes:
         contexts: (M,) uint8, or None for one context.
-        class_of: (A,) uint8 class of each token.
+        class_by_token: (A,) uint8 class of each token.
         classes: number of classes.
     """
 
     contexts: np.ndarray | None
-    class_of: np.ndarray
+    class_by_token: np.ndarray
     classes: int
 
     def load(self, tokens: np.ndarray, lanes: LaneLayout, start: int, stop: int, out: np.ndarray) -> None:
@@ -86,7 +86,7 @@ class ModelSelector:
         if self.classes > 1:
             before = np.zeros((_STEPS_PER_BLOCK, lanes.used_lanes), np.uint8)
             lanes.load(tokens, max(start - 1, 0), stop - 1, before[start == 0 :])
-            out += self.class_of.take(before)  # Before the first step this is token 0, whose class is 0.
+            out += self.class_by_token.take(before)  # Before the first step this is token 0, whose class is 0.
 
 
 def count_tokens(
@@ -155,18 +155,18 @@ def encode_lanes(
             np.multiply(keys, frequencies.shape[1], out=keys)
             np.add(keys, loaded, out=keys)
             f, base = frequency_of.take(keys[: end - first]), base_of.take(keys[: end - first])
-            rest = np.uint32(FREQUENCY_TOTAL) - f
+            complement = np.uint32(FREQUENCY_TOTAL) - f
             for step in reversed(range(first, end)):
                 n, row = lanes.active_lanes(step), step - first
-                x, now, q, high = states[:n], f[row, :n], quotients[:n], shifted[:n]
+                x, step_f, q, high = states[:n], f[row, :n], quotients[:n], shifted[:n]
                 np.right_shift(x, np.uint32(32 - SCALE_BITS), out=high)
-                lane = np.flatnonzero(np.greater_equal(high, now, out=full[:n]))
+                lane = np.flatnonzero(np.greater_equal(high, step_f, out=full[:n]))
                 if len(lane):
                     flushed = x.take(lane)
                     emitted.append(flushed.astype(np.uint16))
                     x[lane] = flushed >> np.uint32(16)
-                np.floor_divide(x, now, out=q)
-                np.multiply(q, rest[row, :n], out=q)
+                np.floor_divide(x, step_f, out=q)
+                np.multiply(q, complement[row, :n], out=q)
                 np.add(x, q, out=x)
                 np.add(x, base[row, :n], out=x)
     return states, np.concatenate([np.zeros(0, np.uint16), *reversed(emitted)])
@@ -187,7 +187,13 @@ class LaneDecoder:
 
     def __init__(self, selector: ModelSelector, lanes: LaneLayout, states: np.ndarray, words: np.ndarray) -> None:
         self.tokens = np.empty(lanes.count, np.uint8)
-        self._selector, self._lanes, self._states, self._words, self._place = selector, lanes, states.copy(), words, 0
+        self._selector, self._lanes, self._states, self._words, self._position = (
+            selector,
+            lanes,
+            states.copy(),
+            words,
+            0,
+        )
 
     def run(self, start: int, stop: int, frequencies: np.ndarray) -> None:
         """Decode the steps start to stop - 1 with the given frequencies (K, A).
@@ -197,7 +203,7 @@ class LaneDecoder:
         """
         selector, lanes, words = self._selector, self._lanes, self._words
         table = _decoding_table(frequencies)
-        class_shift = selector.class_of.astype(np.int64) << SCALE_BITS
+        class_shift = selector.class_by_token.astype(np.int64) << SCALE_BITS
         entries = np.zeros((_STEPS_PER_BLOCK, lanes.used_lanes), np.uint32)
         bases = np.zeros((_STEPS_PER_BLOCK, lanes.used_lanes), np.int64)
         before, indices = np.zeros((2, lanes.used_lanes), np.int64)
@@ -231,10 +237,10 @@ class LaneDecoder:
                 np.add(x, offset, out=x)
                 lane = np.flatnonzero(np.less(x, np.uint32(START_STATE), out=low[:n]))
                 if len(lane):
-                    read = words[self._place : self._place + len(lane)]
+                    read = words[self._position : self._position + len(lane)]
                     if len(read) < len(lane):
                         raise DamagedDataError("rANS stream: it ends before its last symbol; it is truncated")
-                    self._place += len(lane)
+                    self._position += len(lane)
                     x[lane] = x.take(lane) << np.uint32(16) | read
                 if selector.classes > 1:
                     np.right_shift(entry, np.uint32(25), out=index, casting="unsafe")
@@ -249,7 +255,7 @@ class LaneDecoder:
         """
         if (self._states != START_STATE).any():
             raise DamagedDataError("rANS stream: its end does not fit its symbols; the data is damaged")
-        return self._place
+        return self._position
 
 
 def _decoding_table(frequencies: np.ndarray) -> np.ndarray:

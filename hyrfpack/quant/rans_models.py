@@ -1,7 +1,7 @@
 """Frequencies for the rANS coder: the probability of each token, in 4096ths.
 
 A *model* is one row of frequencies; a stream has one model per context. Every function takes and returns the rows of
-all models. Further axes in front are moments in a stream, between which adaptive models change. The decoder's symbols
+all models. Further axes in front are points in a stream, between which adaptive models change. The decoder's symbols
 depend on these numbers, so they are computed in integers only.
 """
 

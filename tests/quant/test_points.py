@@ -286,7 +286,7 @@ def test_undeclared_classes_are_refused(kind: int) -> None:
     gaps, classes = encode_integers(np.array([1, 1])), encode_integers(np.array([0, kind]), np.zeros(2, np.uint8))
     data = HEADER_STRUCT.pack(2, 2, len(gaps), len(classes)) + bytes([2, 2]) + gaps + classes
 
-    with pytest.raises(DamagedDataError, match=f"class {kind} of 2"):
+    with pytest.raises(DamagedDataError, match=f"a class {kind}, but only 2 are declared"):
         decode_points(data, 2)
 
 
