@@ -19,7 +19,7 @@ from hyrfpack.ops.dispatch import (
     GPU_OPERATIONS,
     MIXED_PRECISION,
     has_triton,
-    is_plain_torch_wanted,
+    is_plain_torch_requested,
     set_replaced_operations,
 )
 from hyrfpack.parallel.child_items import Row
@@ -143,7 +143,7 @@ def _agree_on_failed_operations(device: torch.device, ranks: Ranks) -> None:
 def _find_failed_operations(device: torch.device) -> frozenset[str]:
     """Return the operations whose kernels do not work on a GPU. A warning names them, once in this process."""
     where = describe_device(device)
-    if is_plain_torch_wanted():
+    if is_plain_torch_requested():
         _LOG.info(f"{PLAIN_TORCH_VARIABLE} is set: {where} runs plain torch in place of kernels")
         return frozenset(GPU_OPERATIONS)
     test = load_or_run_self_test(device)

@@ -176,7 +176,7 @@ def collect_splat_inputs(model: HybridModel, viewpoint: Tensor) -> dict[str, Ten
 
     The colours are those seen from a point (3,) in local units.
     """
-    gaussians = model.decode_geometry().at(model.gaussians.positions.detach())
+    gaussians = model.decode_geometry().with_means(model.gaussians.positions.detach())
     return gaussians._asdict() | {"colors": model.decode_colors(viewpoint.to(gaussians.means))}
 
 

@@ -65,17 +65,17 @@ def scene_provenance(scene: Scene) -> dict:
     pictures. So a model of small photos is the same file, byte for byte, with and without a size limit.
     """
     cameras = [view.camera for view in scene.train]
-    points = np.zeros((0, 3)) if scene.points is None else scene.points
+    points = scene.points
     unit = float(np.std(points)) / 100 if len(points) else 1.0  # so small that the near plane hides nothing
     stored, ratio = select_representative_cameras(cameras, points, unit, MAX_STORED_CAMERAS, MAX_STORED_CAMERAS)
-    kept: dict = {"viewpoint": Viewpoint.from_cameras(cameras).to_json(), "cameras": provenance_cameras(stored)}
+    provenance: dict = {"viewpoint": Viewpoint.from_cameras(cameras).to_json(), "cameras": provenance_cameras(stored)}
     if ratio > 1:
-        kept[RATE_RATIO_KEY] = _rounded_ratio(ratio)
+        provenance[RATE_RATIO_KEY] = _rounded_ratio(ratio)
     is_small = all(max(view.camera.width, view.camera.height) < DEFAULT_MAX_SIZE for view in scene.views)
     is_redundant = scene.max_size is None or (is_small and scene.max_size == DEFAULT_MAX_SIZE)
     if not is_redundant:
-        kept["max_size"] = scene.max_size
-    return kept
+        provenance["max_size"] = scene.max_size
+    return provenance
 
 
 def quantized_provenance(provenance: dict, scale: float, points: np.ndarray | None = None) -> dict:
@@ -94,11 +94,11 @@ def quantized_provenance(provenance: dict, scale: float, points: np.ndarray | No
         points: (N, 3) the Gaussians' centres in world units; without them, the cameras are evenly spaced.
     """
     replaced = ("cameras", RATE_RATIO_KEY) if "cameras" in provenance else ()
-    kept = {name: value for name, value in provenance.items() if name not in replaced}
-    if "psnr" in kept:
-        kept.setdefault(PSNR_BEFORE_KEY, PSNR_BEFORE_COMPRESSION)
+    shortened = {name: value for name, value in provenance.items() if name not in replaced}
+    if "psnr" in shortened:
+        shortened.setdefault(PSNR_BEFORE_KEY, PSNR_BEFORE_COMPRESSION)
     with suppress(TypeError, ValueError, ArithmeticError, KeyError):
-        kept["viewpoint"] = Viewpoint.from_json(provenance["viewpoint"]).to_json(rounded=True)
+        shortened["viewpoint"] = Viewpoint.from_json(provenance["viewpoint"]).to_json(rounded=True)
     with suppress(TypeError, ValueError, ArithmeticError, KeyError):
         cameras = [camera_from_numbers(numbers) for numbers in provenance["cameras"]]
         cameras, ratio = select_representative_cameras(
@@ -106,15 +106,15 @@ def quantized_provenance(provenance: dict, scale: float, points: np.ndarray | No
         )
         ratio *= stored_rate_ratio(provenance)
         if ratio > COARSE_RATE_RATIO:
-            kept[RATE_RATIO_KEY] = _rounded_ratio(ratio)
+            shortened[RATE_RATIO_KEY] = _rounded_ratio(ratio)
         farthest = max((float(np.linalg.norm(camera.position)) for camera in cameras), default=0.0)
         # Rounding a rotation moves the camera in proportion to its distance from the origin.
         decimals = (
             int(np.clip(np.ceil(np.log10(max(2 * farthest / scale, 1e-9) * COARSE_POSE_STEPS_PER_SCENE_SCALE)), 4, 9)),
             int(np.clip(np.ceil(np.log10(COARSE_POSE_STEPS_PER_SCENE_SCALE / scale)), 0, MAX_COARSE_DECIMALS)),
         )
-        kept["coarse_cameras"] = [camera_to_numbers(camera, decimals) for camera in cameras]
-    return kept
+        shortened["coarse_cameras"] = [camera_to_numbers(camera, decimals) for camera in cameras]
+    return shortened
 
 
 def _rounded_ratio(ratio: float) -> float:
@@ -230,16 +230,16 @@ class Capture:
         """
         views = [] if self.scene is None else self.scene.views
         try:
-            kept = [camera_from_numbers(numbers) for numbers in self._stored_cameras or self._coarse_cameras or ()]
+            stored = [camera_from_numbers(numbers) for numbers in self._stored_cameras or self._coarse_cameras or ()]
             limit = _MAX_MATCH_DISTANCE_SCENE_SCALES * float(self.facts["config"]["frame"]["scale"])
         except (TypeError, ValueError, ArithmeticError, KeyError):
             return np.zeros(0)
-        if not (views and kept):
+        if not (views and stored):
             return np.zeros(0)
         positions = np.array([view.camera.position for view in views])
         directions = np.array([view.camera.forward for view in views])
         differences = []
-        for camera in kept:
+        for camera in stored:
             distances = np.linalg.norm(positions - camera.position, axis=1) / limit
             angles = np.degrees(np.arccos(np.clip(directions @ camera.forward, -1, 1))) / _MAX_MATCH_ANGLE_DEGREES
             differences.append(np.maximum(distances, angles).min())

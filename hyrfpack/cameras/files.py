@@ -58,12 +58,8 @@ def camera_to_numbers(camera: Camera, decimals: tuple[int, int] | None = None) -
     rotation, translation = decimals
     rows = ([*(round(x, rotation) for x in row[:3]), round(row[3], translation)] for row in pose)
     lens = (round(number, 1) for number in camera.intrinsics)
-    return [
-        camera.width,
-        camera.height,
-        *lens,
-        *(x + 0.0 for row in rows for x in row),
-    ]  # adding 0.0 turns -0.0 into 0.0
+    # Adding 0.0 turns -0.0 into 0.0.
+    return [camera.width, camera.height, *lens, *(x + 0.0 for row in rows for x in row)]
 
 
 def camera_from_numbers(numbers: Sequence[Any]) -> Camera:
@@ -146,8 +142,10 @@ def focal_entries(frame: Mapping[str, Any], shared: Mapping[str, Any]) -> dict[s
 
     They are the frame's own, then those for all frames. If the frame has a field of view, all are its own.
     """
-    own, common = ({key: each[key] for key in _FOCAL_KEYS if each.get(key) is not None} for each in (frame, shared))
-    return own if own.keys() & {"camera_angle_x", "camera_angle_y"} else common | own
+    of_frame, of_all = (
+        {key: values[key] for key in _FOCAL_KEYS if values.get(key) is not None} for values in (frame, shared)
+    )
+    return of_frame if of_frame.keys() & {"camera_angle_x", "camera_angle_y"} else of_all | of_frame
 
 
 def focal_lengths(entries: Mapping[str, float], from_angle: Callable[[str], float]) -> tuple[float, float] | None:
@@ -169,7 +167,7 @@ def focal_lengths(entries: Mapping[str, float], from_angle: Callable[[str], floa
 
 def _parse_transforms_frame(frame: dict[str, Any], shared: dict[str, Any], name: str) -> tuple[str, Camera]:
     """Parse a frame of a transforms.json, whose camera has OpenGL axes."""
-    item = {key: value for each in (shared, frame) for key, value in each.items() if value is not None}
+    item = {key: value for values in (shared, frame) for key, value in values.items() if value is not None}
     sides = {"camera_angle_x": item["w"], "camera_angle_y": item["h"]}
     entries = {key: _finite_float(value) for key, value in focal_entries(frame, shared).items()}
     focal = focal_lengths(entries, lambda key: sides[key] / (2 * math.tan(entries[key] / 2)))
@@ -207,6 +205,6 @@ def _focal_length(value: Any) -> float:
 def round_number(number: float) -> float:
     """Round a number to nine significant digits, or to six decimal places if its magnitude is 1,000 or more.
 
-    The second rule keeps the decimals of large map coordinates.
+    Large map coordinates thus keep six decimal places.
     """
     return float(f"{number:.9g}") if abs(number) < 1000 else round(float(number), 6)

@@ -89,7 +89,7 @@ class Placement:
         """Read the result of `to_json`.
 
         Raises:
-            KeyError, TypeError, ValueError: it is none.
+            KeyError, TypeError, ValueError: `stored` is not a placement.
         """
         factor, offset = float(stored["factor"]), np.array(stored["offset"], np.float64)
         if offset.shape != (3,) or not (np.isfinite(offset).all() and 0 < factor < math.inf):

@@ -60,8 +60,8 @@ class PhotoCameras:
         stride = int(cast(float, stored)) if is_valid else DEFAULT_BACKGROUND_STRIDE
         for key in ("cameras", "coarse_cameras"):
             with suppress(TypeError, ValueError, ArithmeticError):
-                kept = list(provenance.get(key) or ())[:MAX_SAMPLING_CAMERAS]
-                if cameras := [camera_from_numbers(numbers) for numbers in kept]:
+                stored_cameras = list(provenance.get(key) or ())[:MAX_SAMPLING_CAMERAS]
+                if cameras := [camera_from_numbers(numbers) for numbers in stored_cameras]:
                     default = COARSE_RATE_RATIO if key == "coarse_cameras" else 1.0
                     return cls(cameras, stored_rate_ratio(provenance, default), stride)
         return cls((), 1.0, stride)
@@ -131,7 +131,7 @@ def stored_rate_ratio(provenance: dict, default: float = 1.0) -> float:
 
 
 def select_representative_cameras(
-    cameras: Sequence[Camera], points: np.ndarray, scale: float, least: int, most: int
+    cameras: Sequence[Camera], points: np.ndarray, scale: float, min_count: int, max_count: int
 ) -> tuple[list[Camera], float]:
     """Select cameras whose sampling rates come near to those of all cameras, in the given order.
 
@@ -140,17 +140,17 @@ def select_representative_cameras(
 
     Args:
         cameras: all cameras.
-        points: (N, 3) in world units; MAX_SELECTION_POINTS of them are used. Without points, `least` cameras are evenly
-            spaced.
+        points: (N, 3) in world units; MAX_SELECTION_POINTS of them are used. Without points, `min_count` cameras are
+            evenly spaced.
         scale: world units of a local unit.
-        least, most: limits of the number of selected cameras.
+        min_count, max_count: limits of the number of selected cameras.
 
     Returns:
         The cameras, and the rate of all cameras relative to that of the selected ones, 1 or more: it is at most this at
         REPRESENTED_SHARE of the points. 1 without points.
     """
-    if len(cameras) <= least or not len(points):
-        return evenly_spaced(cameras, least), 1.0
+    if len(cameras) <= min_count or not len(points):
+        return evenly_spaced(cameras, min_count), 1.0
     points = points[:: -(-len(points) // MAX_SELECTION_POINTS)]
     center = points.mean(axis=0)
     local = ((points - center) / scale).astype(np.float32).T
@@ -162,14 +162,14 @@ def select_representative_cameras(
     logs, is_seen = np.log(np.maximum(rates, floor)), highest > 0
     all_logs = logs.max(axis=0)
     limit, selected, best, ratio = np.log(MAX_REPRESENTED_RATIO), [0], logs[0], 0.0
-    while len(selected) < min(most, len(cameras)):
+    while len(selected) < min(max_count, len(cameras)):
         gains = np.maximum(logs, best).sum(axis=1)
         gains[selected] = -np.inf
         selected.append(int(gains.argmax()))
         best = np.maximum(best, logs[selected[-1]])
         missing = (all_logs - best)[is_seen]
         ratio = float(np.quantile(missing, REPRESENTED_SHARE)) if len(missing) else 0.0
-        if len(selected) >= least and ratio <= limit:
+        if len(selected) >= min_count and ratio <= limit:
             break
     return [cameras[index] for index in sorted(selected)], float(np.exp(ratio))
 

@@ -64,17 +64,17 @@ def sample_windows(cameras: Sequence[Camera], count: int, cells: int, seed: int 
         cells: number of windows of a picture; 1 for whole pictures. At most as many as there are views.
         seed: random seed of the views between cameras, and of the order of windows.
     """
-    at, between = sample_views(cameras, count // 2, seed)
-    views = [view for pair in zip(at, between, strict=True) for view in pair]
+    at_cameras, between_cameras = sample_views(cameras, count // 2, seed)
+    views = [view for pair in zip(at_cameras, between_cameras, strict=True) for view in pair]
     cells = max(1, min(cells, len(views)))
     columns = round(cells**0.5)
     rows = cells // columns
     order = np.random.default_rng(seed).permutation(columns * rows)
     windows = []
     for number, view in enumerate(views):
-        turn = number // 2 + (number % 2) * (len(order) // 2)  # Both kinds of views show all cells.
+        position = number // 2 + (number % 2) * (len(order) // 2)  # Both kinds of views show all cells.
         grid = divide_view(view, columns, rows)
-        windows.append(grid[order[turn % len(order)] % len(grid)])
+        windows.append(grid[order[position % len(order)] % len(grid)])
     return Windows(windows, columns, rows)
 
 

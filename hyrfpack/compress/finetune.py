@@ -25,7 +25,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains, clamp_colors
 from hyrfpack.ops.ssim import photometric_loss
 from hyrfpack.ops.transfer import HostCopy
-from hyrfpack.parallel.pool import freed_memory_kept, torch_on_one_thread
+from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import render_view
@@ -164,7 +164,7 @@ class _Finetuner:
             HyrfTrainingError: the loss or a gradient is not finite.
         """
         order = shuffled(self.views, self.seed, range(self.ranks.rank, self.steps * self.ranks.size, self.ranks.size))
-        with closing(cache.stream(order)) as pictures, torch_on_one_thread(), freed_memory_kept():
+        with closing(cache.stream(order)) as pictures, torch_on_one_thread(), keep_freed_memory():
             for step in range(1, self.steps + 1):
                 problem: HyrfError | None = None
                 rendered: _BackpropagatedView | None = None

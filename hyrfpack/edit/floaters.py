@@ -118,7 +118,7 @@ def _fit_supported_shares(
 @torch.no_grad()
 def _mean_light(model: HybridModel, views: Sequence[View], settings: RenderSettings) -> Tensor:
     """Return the light (N, 1) of the Gaussians in pixels, the mean of all views."""
-    gaussians = model.decode_geometry().at(model.gaussians.positions)
+    gaussians = model.decode_geometry().with_means(model.gaussians.positions)
     raster_settings = settings.raster_settings(model.config.antialiased)
     light = gaussians.means.new_zeros((1, len(model)))
     for view in views:

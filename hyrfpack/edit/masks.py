@@ -32,7 +32,7 @@ def share_of_light_in_masks(
     Returns:
         (N,) float64 in [0, 1]; 0 for a Gaussian that no photo shows.
     """
-    gaussians = model.decode_geometry().at(model.gaussians.positions.detach())
+    gaussians = model.decode_geometry().with_means(model.gaussians.positions.detach())
     settings = RenderSettings().raster_settings(model.config.antialiased)
     light = gaussians.means.new_zeros((2, len(model)), dtype=torch.float64)
     for number, view in enumerate(views):

@@ -28,7 +28,7 @@ from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains, clamp_colors
 from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.ops.ssim import photometric_loss
-from hyrfpack.parallel.pool import freed_memory_kept, parallel_map, torch_on_one_thread
+from hyrfpack.parallel.pool import keep_freed_memory, parallel_map, torch_on_one_thread
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera, View
@@ -88,7 +88,7 @@ def refit_region(
     optimizer = Optimizer(trained, rates)
     resolution = ResolutionSchedule(shown, steps, len(model), has_coarse_background=False)
     order = map(resolution.reduce_view, shuffled(shown, 0, range(steps)), range(1, steps + 1))
-    with closing(cache.stream(order)) as pictures, torch_on_one_thread(), freed_memory_kept():
+    with closing(cache.stream(order)) as pictures, torch_on_one_thread(), keep_freed_memory():
         for step, (view, picture) in enumerate(pictures):
             progress(TaskEvent(f"training the region, step {step + 1}/{steps}", step / steps))
             solid = np.array(model.config.solid, np.float32)
@@ -123,7 +123,7 @@ def region_light_share(model: HybridModel, geometry: Geometry, is_selected: np.n
         is_selected: (N,) bool, the Gaussians.
         camera: the camera, in world units.
     """
-    gaussians = geometry.at(model.gaussians.positions)
+    gaussians = geometry.with_means(model.gaussians.positions)
     colors = torch.from_numpy(is_selected).to(gaussians.means)[:, None].expand(-1, 3).contiguous()
     viewport = model.config.frame.local_viewport(camera, gaussians.means.dtype)
     settings = RenderSettings().raster_settings(model.config.antialiased)

@@ -193,7 +193,7 @@ def _compute_camera_visibility(model: HybridModel, geometry: Geometry, camera: C
     check_finite("camera poses", viewport.pose)
     raster_settings = settings.raster_settings(model.config.antialiased)
     drawn = frustum_cull(positions, viewport, settings.near, settings.cull_tolerance)
-    gaussians = geometry.at(positions)
+    gaussians = geometry.with_means(positions)
     culled_light, transmittance = sum_blend_weights(gaussians, viewport, raster_settings)
     light = culled_light[drawn]
     culled_light[drawn] = 0
@@ -221,7 +221,7 @@ def _fit_harmonics(
     progress: Progress,
 ) -> dict[int, Tensor]:
     """Fit the harmonics (N, K, 3) of all Gaussians for each degree."""
-    shading, positions = model.shading(), model.gaussians.positions.detach()
+    shading, positions = model.compute_shading(), model.gaussians.positions.detach()
     residuals = model.gaussians.color_residuals
     fitted = {degree: positions.new_empty(len(model), num_sh_bases(degree), 3) for degree in degrees}
     highest = max(fitted)

@@ -7,7 +7,7 @@ import torch
 from hyrfpack.model import HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
-from hyrfpack.model.shape_residuals import shape_residuals
+from hyrfpack.model.shape_residuals import compute_shape_residuals
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.harmonics import SH_C0
 
@@ -45,7 +45,7 @@ def exact_model(drawable: Drawable) -> HybridModel:
         residual_degree=drawable.degree,
     )
     sizes = drawable.scales.clamp_min(MIN_SCALE_LOCAL) / scale_bounds(positions, config)
-    shapes, scale_logits = shape_residuals(
+    shapes, scale_logits = compute_shape_residuals(
         positions.new_zeros(len(positions), FIELD_OUTPUTS), logit(sizes), drawable.quats
     )
     opacity_logits = logit(drawable.opacities[:, None].clamp_max(MAX_OPACITY))

@@ -19,7 +19,7 @@ from hyrfpack.ops.rasterize import rasterize
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.render.parts import camera_frame, gather_geometry
-from hyrfpack.render.renderer import raster_settings_of
+from hyrfpack.render.renderer import make_raster_settings
 from hyrfpack.scene import Camera
 
 ERROR_RADII = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0)
@@ -142,9 +142,10 @@ class _PooledChunks:
         if isinstance(model, MergedModel):
             gaussians, frame = gather_geometry(model, camera, index, self.decoded), camera_frame(model, camera)
         else:
-            gaussians, frame = self.decoded[index].geometry.at(model.gaussians.positions[index]), model.config.frame
+            frame = model.config.frame
+            gaussians = self.decoded[index].geometry.with_means(model.gaussians.positions[index])
         viewport = frame.local_viewport(camera, gaussians.means.dtype)
-        settings = raster_settings_of(model, RenderSettings())
+        settings = make_raster_settings(model, RenderSettings())
         return rasterize(gaussians, torch.from_numpy(members).to(gaussians.means), viewport, settings).rgb
 
 

@@ -14,7 +14,7 @@ from hyrfpack.lod.partition import cluster
 from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.gaussians import LOGIT_LIMIT, Gaussians, logit
 from hyrfpack.model.residuals import add_shape_residuals, color_differences
-from hyrfpack.model.shape_residuals import shape_residuals
+from hyrfpack.model.shape_residuals import compute_shape_residuals
 from hyrfpack.rotations import rotation_matrices
 
 MAX_OPACITY = 0.99
@@ -167,4 +167,4 @@ def _match_shapes(plain: HybridModel, raw: Tensor, merged: Moments) -> tuple[Ten
     axes *= np.sign(np.linalg.det(axes))[:, None, None]
     quats = Rotation.from_matrix(axes).as_quat(scalar_first=True)
     sizes = torch.from_numpy(np.sqrt(np.maximum(variances, 0))) / plain.scale_bounds(plain.gaussians.positions)
-    return shape_residuals(raw, logit(sizes), torch.from_numpy(quats).float())
+    return compute_shape_residuals(raw, logit(sizes), torch.from_numpy(quats).float())

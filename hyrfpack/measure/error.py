@@ -19,20 +19,20 @@ class Error:
     rms: float
 
 
-def measure_error(values: Tensor, reference: Tensor, what: str) -> Error:
+def measure_error(values: Tensor, reference: Tensor, subject: str) -> Error:
     """Compute the largest and the root mean square difference of two tensors of the same shape, in float64.
 
     Args:
         values: the tensor to measure.
         reference: the correct values.
-        what: what is measured, for the error message.
+        subject: what is measured, for the error message.
 
     Raises:
         HyrfError: a tensor holds NaN or infinity.
     """
     if not (torch.isfinite(values).all() and torch.isfinite(reference).all()):
         raise HyrfError(
-            f"{what}: the result holds NaN or infinity, so that the error cannot be measured",
+            f"{subject}: the result holds NaN or infinity, so that the error cannot be measured",
             fix="check the model",
         )
     deviation = values.detach().double() - reference.detach().double()
@@ -41,12 +41,13 @@ def measure_error(values: Tensor, reference: Tensor, what: str) -> Error:
     return Error(float(deviation.abs().max()), float(deviation.square().mean().sqrt()))
 
 
-def measure_relative_error(values: Tensor, reference: Tensor, what: str) -> Error:
+def measure_relative_error(values: Tensor, reference: Tensor, subject: str) -> Error:
     """Compute errors relative to the reference: `max` to its largest magnitude, `rms` to its root mean square.
 
     The errors are absolute if the reference is all zero. Arguments and exceptions are those of `measure_error`.
     """
-    absolute, size = measure_error(values, reference, what), measure_error(reference, torch.zeros_like(reference), what)
+    absolute = measure_error(values, reference, subject)
+    size = measure_error(reference, torch.zeros_like(reference), subject)
     return Error(absolute.max / (size.max or 1), absolute.rms / (size.rms or 1))
 
 

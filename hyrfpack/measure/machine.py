@@ -30,11 +30,11 @@ def describe_machine() -> dict[str, object]:
 
 def package_versions(*packages: str) -> dict[str, str | None]:
     """Return the installed version of each package, None for those that are not installed."""
-    found: dict[str, str | None] = dict.fromkeys(packages)
+    versions: dict[str, str | None] = dict.fromkeys(packages)
     for package in packages:
         with suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found
+            versions[package] = version(package)
+    return versions
 
 
 def driver_version() -> str | None:
@@ -43,8 +43,8 @@ def driver_version() -> str | None:
         with suppress(OSError):
             if match := re.search(pattern, Path(path).read_text()):
                 return match[0]
-    ask = getattr(torch._C, "_cuda_getDriverVersion", None)  # only builds of torch for CUDA have it
-    return str(ask()) if ask is not None and torch.cuda.is_available() else None
+    query = getattr(torch._C, "_cuda_getDriverVersion", None)  # only builds of torch for CUDA have it
+    return str(query()) if query is not None and torch.cuda.is_available() else None
 
 
 def format_machine(facts: dict[str, object]) -> str:

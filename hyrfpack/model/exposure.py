@@ -73,12 +73,12 @@ class ExposureMap:
     writing and reading a map changes nothing.
 
     Attributes:
-        box: (2, 3) float32, least and largest position of the training cameras per axis, local units.
+        box: (2, 3) float32, lowest and highest coordinate of the training cameras per axis, local units.
         lengths: (2,) float32 > 0, l_x in local units and l_f in units of the sphere of directions.
         mean: (3,) float32 log gains far from all centres.
         limits: (2, 3) float32, lowest and highest log gain of each channel, in [-8, 8].
         steps: (3,) float32, quantisation step of the weights of each channel.
-        positions: (M, 3) uint8, x_m = least + code / 255 (largest - least). M <= 64.
+        positions: (M, 3) uint8, x_m = box[0] + code / 255 (box[1] - box[0]). M <= 64.
         directions: (M, 3) int8, f_m = code / 127.
         weights: (M, 3) int16, w_m = code * step.
     """
@@ -128,17 +128,17 @@ class ExposureMap:
         Returns:
             (..., 3) float64 within `limits`.
         """
-        places, directions = (np.asarray(part, np.float64).reshape(-1, 3) for part in (position, direction))
-        logs = self.mean + self.kernel_at(places, directions) @ self._weights
-        return np.clip(logs, *self.limits.astype(np.float64)).reshape(np.shape(position))
+        positions, directions = (np.asarray(part, np.float64).reshape(-1, 3) for part in (position, direction))
+        log_gains = self.mean + self.evaluate_kernel(positions, directions) @ self._weights
+        return np.clip(log_gains, *self.limits.astype(np.float64)).reshape(np.shape(position))
 
-    def kernel_at(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    def evaluate_kernel(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return the kernel (N, M) between viewpoints, given by positions and directions (N, 3), and the centres."""
         return inverse_quadratic_kernel(
             self._features(np.clip(positions, *self.box.astype(np.float64)), directions), self._centers
         )
 
-    def kernel_of_centers(self) -> np.ndarray:
+    def evaluate_center_kernel(self) -> np.ndarray:
         """Return the kernel (M, M) between all centres."""
         return inverse_quadratic_kernel(self._centers, self._centers)
 
@@ -157,15 +157,15 @@ class ExposureMap:
 
         where |a - b| is the distance between features: position over l_x, direction over l_f.
         """
-        gram = self.kernel_of_centers()
+        gram = self.evaluate_center_kernel()
         norm = float(np.sqrt(np.maximum(np.einsum("mc,mn,nc->c", self._weights, gram, self._weights), 0).max()))
         along_position, along_direction = np.sqrt(2) * norm / self.lengths.astype(np.float64)
         return float(along_position), float(along_direction)
 
     @cached_property
     def _centers(self) -> np.ndarray:
-        least, largest = self.box.astype(np.float64)
-        positions = least + self.positions / MAX_POSITION_CODE * (largest - least)
+        low, high = self.box.astype(np.float64)
+        positions = low + self.positions / MAX_POSITION_CODE * (high - low)
         return self._features(positions, self.directions / MAX_DIRECTION_CODE)
 
     @cached_property
@@ -174,5 +174,5 @@ class ExposureMap:
 
     def _features(self, positions: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return the features (N, 6) that the kernel compares: scaled positions and directions."""
-        length, chord = self.lengths.astype(np.float64)
-        return np.concatenate((positions / length, directions / chord), 1)
+        position_length, direction_length = self.lengths.astype(np.float64)
+        return np.concatenate((positions / position_length, directions / direction_length), 1)

@@ -46,7 +46,7 @@ class Geometry:
     def __getitem__(self, index: Tensor) -> Geometry:
         return Geometry(self.scales[index], self.quats[index], self.opacities[index])
 
-    def at(self, means: Tensor) -> Gaussians3D:
+    def with_means(self, means: Tensor) -> Gaussians3D:
         """Return the Gaussians with this geometry and these centres (N, 3)."""
         return Gaussians3D(means, self.quats, self.scales, self.opacities)
 
@@ -137,7 +137,7 @@ class HybridModel(nn.Module):
         return model
 
     def copy_settings(self, other: HybridModel) -> None:
-        """Take over precision, exposure map and background spacing of another model."""
+        """Set precision, exposure map and background spacing to those of another model."""
         self.precision, self.exposure = other.precision, other.exposure
         self.background_spacing = other.background_spacing
 
@@ -172,22 +172,22 @@ class HybridModel(nn.Module):
     def add_shading(self, geometry: Geometry) -> Decoded:
         """Return what `decode` does, given the geometry of all Gaussians."""
         is_faster = self.gaussians.positions.device.type in ("cpu", "cuda") and not self.radiance.is_constant_zero
-        return Decoded(geometry, self.shading() if is_faster else None)
+        return Decoded(geometry, self.compute_shading() if is_faster else None)
 
     @torch.no_grad()
-    def shading(self) -> Shading:
+    def compute_shading(self) -> Shading:
         """Evaluate the view-independent part of the colour decoder's first layer for all Gaussians."""
         field, explicit = self.radiance, self.gaussians
-        places = field.grid.feature_count
+        position_inputs = field.grid.feature_count
         (weight, w2, w3), (bias, b2, b3) = self._color_layers()
         first = weight.new_empty(len(self), len(bias), dtype=torch.bfloat16 if self._mixed else None)
 
         def evaluate(positions: Tensor) -> Tensor:
-            return mlp(field.grid(self.cube_coords(positions)), [weight[:, :places]], [bias], mixed=self._mixed)
+            return mlp(field.grid(self.cube_coords(positions)), [weight[:, :position_inputs]], [bias], mixed=self._mixed)
 
         return Shading(
             self._fill_blocks(first, evaluate),
-            weight[:, places:].contiguous(),
+            weight[:, position_inputs:].contiguous(),
             (w2, w3),
             (b2, b3),
             explicit.color_logits.detach(),
@@ -241,12 +241,15 @@ class HybridModel(nn.Module):
         `used` is the number of indices in use, see `hyrfpack.ops.rows`; None if all are.
         """
         explicit = self.gaussians
-        pick = (lambda values: values) if index is None else (lambda values: take_rows(values, index, used))
-        positions = self._field_positions(pick(explicit.positions))
+
+        def select(values: Tensor) -> Tensor:
+            return values if index is None else take_rows(values, index, used)
+
+        positions = self._field_positions(select(explicit.positions))
         raw = self.geometry(self.cube_coords(positions, used), mixed=self._mixed, used=used)
         if explicit.shape_residuals is not None:
-            raw = add_shape_residuals(raw, pick(explicit.shape_residuals))
-        return self.activate(raw, positions, pick(explicit.scale_logits), pick(explicit.opacity_logits), used)
+            raw = add_shape_residuals(raw, select(explicit.shape_residuals))
+        return self.activate(raw, positions, select(explicit.scale_logits), select(explicit.opacity_logits), used)
 
     def activate(
         self,
@@ -259,10 +262,10 @@ class HybridModel(nn.Module):
         """Combine raw outputs (n, 8) of the geometry field with the explicit logits; see `activate_geometry`."""
         half_extent = self.config.frame.half_extent if self.config.scale_grows else None
         rule = self.config.scale_rule
-        parts = activate.activate_geometry(
+        scales, quats, opacities = activate.activate_geometry(
             raw, positions, scale_logits, opacity_logits, half_extent=half_extent, rule=rule, used=used
         )
-        return Geometry(*parts)
+        return Geometry(scales, quats, opacities)
 
     def decode_colors(
         self,
@@ -273,8 +276,8 @@ class HybridModel(nn.Module):
     ) -> Tensor:
         """Return colours (n, 3), 0 or more, of the Gaussians at `index` (n,), seen from `viewpoint` (3,), local units.
 
-        Without colour residuals they lie in (0, 1). `shading` is the result of `shading()`, if it is known; then the
-        colours are not differentiable in the fields. `used` is the number of indices in use, see `hyrfpack.ops.rows`.
+        Without colour residuals they lie in (0, 1). `shading` is the result of `compute_shading()`, if known; then the
+        colours are not differentiable in the fields. `used` is the number of indices in use (`hyrfpack.ops.rows`).
         """
         explicit = self.gaussians
         positions, logits, residuals = explicit.positions, explicit.color_logits, explicit.color_residuals
@@ -324,8 +327,8 @@ class HybridModel(nn.Module):
         return list(self.radiance.weights), list(self.radiance.biases)
 
     def _radiance(self, positions: Tensor, viewpoint: Tensor, used: Tensor | None) -> Tensor:
-        seen = encode_views(positions, viewpoint, self.config.direction_encoding, used=used)
-        return self.radiance(self.cube_coords(positions, used), seen, mixed=self._mixed, used=used)
+        encoded_views = encode_views(positions, viewpoint, self.config.direction_encoding, used=used)
+        return self.radiance(self.cube_coords(positions, used), encoded_views, mixed=self._mixed, used=used)
 
     def __len__(self) -> int:
         return len(self.gaussians)

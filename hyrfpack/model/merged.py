@@ -45,14 +45,17 @@ class MergedModel:
 
     @torch.no_grad()
     def decode(self) -> Decoded:
-        """Evaluate geometry that no view changes, of all Gaussians in the order of the parts, in units of each part."""
+        """Evaluate what does not depend on the view: the geometry of all Gaussians, see `decode_geometry`."""
         return Decoded(self.decode_geometry(), None)
 
     def decode_geometry(self) -> Geometry:
         """Evaluate the geometry of all Gaussians in the order of the parts, in units of each part."""
         parts = [part.decode_geometry() for part in self.parts]
-        values = zip(*((part.scales, part.quats, part.opacities) for part in parts), strict=True)
-        return Geometry(*(torch.cat(value) for value in values))
+        return Geometry(
+            scales=torch.cat([geometry.scales for geometry in parts]),
+            quats=torch.cat([geometry.quats for geometry in parts]),
+            opacities=torch.cat([geometry.opacities for geometry in parts]),
+        )
 
     def subset(self, index: Tensor) -> MergedModel:
         """Return a model with copies of the Gaussians at ascending `index` (n,) int64, counted over all parts.
@@ -62,8 +65,8 @@ class MergedModel:
         ends = np.cumsum([len(part) for part in self.parts])
         bounds = torch.searchsorted(index, torch.from_numpy(ends)).tolist()
         starts, firsts = [0, *bounds[:-1]], [0, *ends[:-1].tolist()]
-        chosen = [index[start:end] - first for start, end, first in zip(starts, bounds, firsts, strict=True)]
-        subsets = (part.subset(some) for part, some in zip(self.parts, chosen, strict=True))
+        indices = [index[start:end] - first for start, end, first in zip(starts, bounds, firsts, strict=True)]
+        subsets = (part.subset(part_index) for part, part_index in zip(self.parts, indices, strict=True))
         return MergedModel(self.names, tuple(subsets))
 
     def to(self, device: torch.device) -> MergedModel:
@@ -72,8 +75,8 @@ class MergedModel:
 
     def without_empty_parts(self) -> MergedModel:
         """Return the model of the parts that have Gaussians, at least one."""
-        kept = [(name, part) for name, part in zip(self.names, self.parts, strict=True) if len(part)]
-        names, parts = zip(*kept, strict=True)
+        nonempty = [(name, part) for name, part in zip(self.names, self.parts, strict=True) if len(part)]
+        names, parts = zip(*nonempty, strict=True)
         return MergedModel(names, parts)
 
     def __len__(self) -> int:
@@ -102,5 +105,5 @@ def map_parts(
 def world_positions(model: HybridModel | MergedModel) -> np.ndarray:
     """Return the centres (N, 3) of the Gaussians of all parts in world units, float64."""
     return np.concatenate(
-        [part.config.frame.to_world(part.gaussians.positions.detach().numpy()) for part in parts_of(model)]
+        [part.config.frame.to_world(part.gaussians.positions.numpy(force=True)) for part in parts_of(model)]
     )

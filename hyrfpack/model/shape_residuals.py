@@ -1,4 +1,4 @@
-"""The shape residuals that give Gaussians their shapes: the inverse of `add_shape_residuals`."""
+"""Computes the shape residuals that give Gaussians their shapes: the inverse of `add_shape_residuals`."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ import torch
 from torch import Tensor
 
 
-def shape_residuals(raw: Tensor, scale_logits: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
+def compute_shape_residuals(raw: Tensor, scale_logits: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
     """Return the shape residuals (N, 5) and explicit scale logits (N, 1) that give Gaussians their shapes.
 
-    A Gaussian stays the same if its axes are exchanged or reversed, in 24 ways. The one nearest to the rotation that
-    the field predicts is taken.
+    A Gaussian stays the same if its axes are exchanged or reversed, which 24 rotations do. Of these, the result is the
+    one nearest to the rotation that the field predicts.
 
     Args:
         raw: (N, 8) outputs of the geometry field.
         scale_logits: (N, 3) total logits of the scales.
         quats: (N, 4) rotations wxyz, of any length above 0.
     """
-    turns = _axis_exchanges().to(raw)
+    exchanges = _axis_exchanges().to(raw)
     identity = torch.eye(1, 4, device=raw.device)
     predicted = torch.nn.functional.normalize(raw[:, 4:] + identity, dim=1)
     difference = _multiply(_conjugate(predicted), torch.nn.functional.normalize(quats, dim=1))
     # The w of the product of two quaternions is the dot product with the conjugate.
-    chosen = (difference @ _conjugate(turns).T).abs().argmax(dim=1)
-    turned = _multiply(difference, turns[chosen])
+    nearest = (difference @ _conjugate(exchanges).T).abs().argmax(dim=1)
+    turned = _multiply(difference, exchanges[nearest])
     cosine = turned[:, :1]
     rotation = turned[:, 1:] / torch.where(cosine == 0, 1, cosine)  # it is 0 only if the field predicts no rotation
-    order = _axis_orders(turns)[chosen]
+    order = _axis_orders(exchanges)[nearest]
     logits = scale_logits.gather(1, order) - raw[:, 1:4]
     mean = logits.mean(dim=1, keepdim=True)
     return torch.cat(((logits - mean)[:, :2], rotation), dim=1), mean

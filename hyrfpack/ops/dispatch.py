@@ -38,7 +38,7 @@ def replaced_operations() -> frozenset[str]:
 
     Their kernels are unusable, or the user wants none.
     """
-    return frozenset(GPU_OPERATIONS) if is_plain_torch_wanted() else _replaced_operations
+    return frozenset(GPU_OPERATIONS) if is_plain_torch_requested() else _replaced_operations
 
 
 def is_mixed_precision_usable() -> bool:
@@ -46,7 +46,7 @@ def is_mixed_precision_usable() -> bool:
     return MIXED_PRECISION not in _replaced_operations
 
 
-def is_plain_torch_wanted() -> bool:
+def is_plain_torch_requested() -> bool:
     """Return whether the environment asks for plain torch in place of all GPU kernels."""
     return os.environ.get(PLAIN_TORCH_VARIABLE, "") not in ("", "0")
 

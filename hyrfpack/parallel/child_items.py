@@ -108,32 +108,32 @@ def run_in_children(
     """
     remaining, end = list(items), time.monotonic() + seconds
 
-    def time_left(item: str) -> float:
+    def remaining_seconds(item: str) -> float:
         return min(inf if item in self_timed else item_seconds, end - time.monotonic())
 
     while remaining:
         remaining_before, current, last_line = len(remaining), None, ""
         child = _Child(command(remaining))
         try:
-            child.limit_time(time_left(remaining[0]))
+            child.limit_time(remaining_seconds(remaining[0]))
             for line in child.lines():
-                kind, _, rest = line.partition(" ")
+                kind, _, content = line.partition(" ")
                 if kind + " " == ROW_PREFIX:
-                    yield json.loads(rest)
+                    yield json.loads(content)
                 elif kind + " " == BEGUN_PREFIX:
-                    current, last_line = rest, ""
-                    child.limit_time(time_left(rest))
+                    current, last_line = content, ""
+                    child.limit_time(remaining_seconds(content))
                 elif kind + " " == DONE_PREFIX:
-                    remaining.remove(rest)
+                    remaining.remove(content)
                     current = None
                 else:
                     last_line = line.strip() or last_line
         finally:
             killed_by = child.stop()
-        said = f"; last output: {last_line[:MAX_NOTE_LENGTH]}" if last_line else ""
+        last_output = f"; last output: {last_line[:MAX_NOTE_LENGTH]}" if last_line else ""
         if remaining and time.monotonic() >= end:
             for item in remaining:
-                note = f"not done within the part's {seconds:.0f} s" + (said if item == current else "")
+                note = f"not done within the part's {seconds:.0f} s" + (last_output if item == current else "")
                 yield {"item": item, "status": "failed", "note": note, "is_temporary": True}
             return
         if current or len(remaining) == remaining_before:  # the child ended within an item, or before its first one
@@ -141,10 +141,10 @@ def run_in_children(
             remaining.remove(failed_item)
             row: Row = {"item": failed_item, "status": "failed"}
             if child.is_out_of_time:
-                yield row | {"note": f"not done within {item_seconds:.0f} s{said}", "is_temporary": True}
+                yield row | {"note": f"not done within {item_seconds:.0f} s{last_output}", "is_temporary": True}
                 continue
-            by = f" by {killed_by}" if killed_by else ""
-            row["note"] = f"its process ended{by}: {last_line[:MAX_NOTE_LENGTH] or 'no output'}"
+            cause = f" by {killed_by}" if killed_by else ""
+            row["note"] = f"its process ended{cause}: {last_line[:MAX_NOTE_LENGTH] or 'no output'}"
             yield row | ({"is_temporary": True} if killed_by in _SIGNALS_FROM_OUTSIDE else {})
 
 
@@ -174,7 +174,7 @@ class _Child:
         yield from (line.rstrip("\n") for line in self._process.stdout)
 
     def limit_time(self, seconds: float) -> None:
-        """Kill the process after so many seconds from now, instead of after the limit that was set before."""
+        """Kill the process `seconds` from now, instead of at the end of an earlier limit."""
         self._timer.cancel()
         self._timer = threading.Timer(max(0.0, seconds), self._expire)
         self._timer.daemon = True

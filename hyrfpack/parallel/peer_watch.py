@@ -131,8 +131,8 @@ def _accept(server: socket.socket, size: int, token: str) -> dict[int, socket.so
             )
             break
         with suppress(OSError, ValueError):
-            given, _, rank = _read_greeting(connection).partition(b" ")
-            if hmac.compare_digest(given, token.encode()) and 0 < int(rank) < size:
+            received_token, _, rank = _read_greeting(connection).partition(b" ")
+            if hmac.compare_digest(received_token, token.encode()) and 0 < int(rank) < size:
                 connections[int(rank)] = _keep_alive(connection)
                 continue
         connection.close()
@@ -140,7 +140,9 @@ def _accept(server: socket.socket, size: int, token: str) -> dict[int, socket.so
 
 
 def _read_greeting(connection: socket.socket) -> bytes:
-    """Read the first line of a connection, which anyone may have opened: at most so many bytes, and not for long.
+    """Read the first line of a connection, which anyone may have opened.
+
+    It reads at most MAX_GREETING_BYTES, for at most GREETING_SECONDS.
 
     Raises:
         OSError: the line did not arrive in time.

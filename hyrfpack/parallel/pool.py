@@ -22,6 +22,9 @@ from hyrfpack.parallel.threads import thread_count
 S = TypeVar("S")
 T = TypeVar("T")
 
+# The C library keeps at most this much free memory: inside `keep_freed_memory`, and after it.
+MAX_KEPT_BYTES_INSIDE = 1 << 30
+MAX_KEPT_BYTES_AFTER = 1 << 20
 # The largest size of kept blocks that older versions of glibc accept.
 MAX_OLD_MMAP_THRESHOLD_BYTES = 1 << 25
 ROWS_PER_BLOCK = 1 << 14
@@ -57,7 +60,7 @@ if hasattr(os, "register_at_fork"):
 
 
 @contextmanager
-def freed_memory_kept() -> Iterator[None]:
+def keep_freed_memory() -> Iterator[None]:
     """Make the C library reuse large memory blocks instead of returning them to the system while the block runs.
 
     Every training step frees and allocates the same tens of megabytes. If the system clears new pages for them each
@@ -65,21 +68,21 @@ def freed_memory_kept() -> Iterator[None]:
     heap has no room are returned as soon as they are freed, which makes a compression that follows 15 to 20 % slower.
     This needs glibc; with other C libraries it does nothing.
     """
-    _set_kept_memory(1 << 30)
+    _set_max_kept_bytes(MAX_KEPT_BYTES_INSIDE)
     try:
         yield
     finally:
-        _set_kept_memory(1 << 20)
+        _set_max_kept_bytes(MAX_KEPT_BYTES_AFTER)
         if (malloc_trim := getattr(_c_library(), "malloc_trim", None)) is not None:
             malloc_trim(0)
 
 
-def _set_kept_memory(nbytes: int) -> None:
-    """Let the C library keep at most so many free bytes, and freed blocks below that size."""
+def _set_max_kept_bytes(max_bytes: int) -> None:
+    """Let the C library keep at most `max_bytes` of free memory, and freed blocks below that size."""
     if (mallopt := getattr(_c_library(), "mallopt", None)) is not None:
         trim_threshold, mmap_threshold = -1, -3
-        mallopt(trim_threshold, nbytes)
-        if not mallopt(mmap_threshold, nbytes):
+        mallopt(trim_threshold, max_bytes)
+        if not mallopt(mmap_threshold, max_bytes):
             mallopt(mmap_threshold, MAX_OLD_MMAP_THRESHOLD_BYTES)
 
 
@@ -128,7 +131,7 @@ def run_tasks(task: Callable[[int], None], count: int, *, sequential: bool = Fal
     pending = iter(range(count))
     errors: dict[int, BaseException] = {}
 
-    def take_remaining_tasks() -> None:
+    def drop_pending_tasks() -> None:
         """Keep all threads from starting further tasks."""
         for _ in pending:
             pass
@@ -140,13 +143,13 @@ def run_tasks(task: Callable[[int], None], count: int, *, sequential: bool = Fal
                 task(index)
             except BaseException as error:
                 errors[index] = error
-                take_remaining_tasks()
+                drop_pending_tasks()
 
     try:
         for future in [_executor(threads).submit(worker) for _ in range(min(threads, count))]:
             future.result()
     except BaseException:  # such as Ctrl-C, which only the main thread notices
-        take_remaining_tasks()
+        drop_pending_tasks()
         raise
     if errors:
         raise errors[min(errors)]
@@ -186,13 +189,13 @@ def parallel_map(
     """
     if device.type != "cpu":
         return [function(item) for item in items]
-    done: dict[int, T] = {}
+    results: dict[int, T] = {}
 
     def run(index: int) -> None:
-        done[index] = function(items[index])
+        results[index] = function(items[index])
 
     run_tasks(run, len(items))
-    return [done[index] for index in range(len(items))]
+    return [results[index] for index in range(len(items))]
 
 
 def map_row_blocks(function: Callable[[slice], torch.Tensor], rows: int, device: torch.device) -> torch.Tensor:

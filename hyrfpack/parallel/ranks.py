@@ -164,8 +164,8 @@ class Ranks:
         if problem is not None and len(failed) == self.size:
             raise problem  # If all processes fail, each raises its own error, as a single process would.
         if failed:
-            rank, kind, what, fix = failed[0]
-            raise kind(f"process {rank} of {self.size}: {what}", fix=fix) from problem
+            rank, error_type, text, fix = failed[0]
+            raise error_type(f"process {rank} of {self.size}: {text}", fix=fix) from problem
 
     def raise_if_lost(self) -> None:
         """Raise an error if another process has ended. This is not collective.
@@ -249,8 +249,10 @@ def join_processes(environment: Mapping[str, str] | None = None) -> Iterator[Ran
                 devices, timeout=COLLECTIVE_TIMEOUT, store=store, rank=ranks.rank, world_size=ranks.size
             )
         else:
-            where = f"tcp://{address}:{port}"
-            dist.init_process_group(devices, where, timeout=COLLECTIVE_TIMEOUT, rank=ranks.rank, world_size=ranks.size)
+            init_method = f"tcp://{address}:{port}"
+            dist.init_process_group(
+                devices, init_method, timeout=COLLECTIVE_TIMEOUT, rank=ranks.rank, world_size=ranks.size
+            )
     except (RuntimeError, ValueError) as error:
         hint = (
             "set MASTER_PORT to a free one" if "EADDRINUSE" in str(error) else "check that all processes were started"

@@ -21,7 +21,7 @@ from hyrfpack.model.merged import MergedModel
 from hyrfpack.outputs import PICTURE_SUFFIXES
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.render.geometry_files import GeometryWriter
-from hyrfpack.render.renderer import RenderedPicture, RenderSettings, raster_settings_of, render_view
+from hyrfpack.render.renderer import RenderedPicture, RenderSettings, make_raster_settings, render_view
 from hyrfpack.render.surface import drawn_gaussians, render_surface
 from hyrfpack.scene import Camera
 
@@ -73,7 +73,7 @@ def make_renderer(
     """Decode a model once, and return a function that renders it with the geometry that is wanted."""
     with torch.no_grad():
         decoded = model.decode()
-    raster_settings = raster_settings_of(model, settings)
+    raster_settings = make_raster_settings(model, settings)
 
     def draw(camera: Camera) -> RenderedPicture:
         rendering = render_view(model, camera, settings, decoded=decoded)
@@ -139,17 +139,19 @@ def to_image(rgb: Tensor) -> Image.Image:
 def unique_stems(names: Sequence[str]) -> list[str]:
     """Convert names of photos to distinct relative paths for renders, inside the folder and without an extension.
 
-    "left/0001.JPG" becomes "left/0001". If two photos differ only in their extensions, all names keep theirs.
+    "left/0001.JPG" becomes "left/0001". If two photos differ only in their extensions, all names keep theirs. If two
+    names are still equal, all get a number in front.
     """
-    full = [_safe_relative_path(name) for name in names]
-    bare = [
-        str(PurePosixPath(name).with_suffix("")) if PurePosixPath(name).suffix.lower() in PICTURE_SUFFIXES else name
-        for name in full
+    paths = [_safe_relative_path(name) for name in names]
+    without_extensions = [
+        str(PurePosixPath(path).with_suffix("")) if PurePosixPath(path).suffix.lower() in PICTURE_SUFFIXES else path
+        for path in paths
     ]
-    chosen = bare if _are_distinct(bare) else full
-    if not _are_distinct(chosen):
-        chosen = [f"{number:04d}_{name}" for number, name in enumerate(chosen)]
-    return chosen
+    if _are_distinct(without_extensions):
+        return without_extensions
+    if _are_distinct(paths):
+        return paths
+    return [f"{number:04d}_{path}" for number, path in enumerate(paths)]
 
 
 def _are_distinct(names: Sequence[str]) -> bool:
@@ -160,8 +162,8 @@ def _are_distinct(names: Sequence[str]) -> bool:
 def _safe_relative_path(name: str) -> str:
     """Return a name without characters and path parts that could lead out of a folder or that a system forbids."""
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in {"/", ".", ".."}]
-    kept = "/".join(parts)
-    return "".join(c if c.isprintable() and c not in ':*?"<>|' else "_" for c in kept) or "view"
+    path = "/".join(parts)
+    return "".join(c if c.isprintable() and c not in ':*?"<>|' else "_" for c in path) or "view"
 
 
 def save_picture(

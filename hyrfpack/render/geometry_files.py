@@ -20,10 +20,10 @@ from hyrfpack.render.renderer import RenderedPicture
 
 _LOG = logging.getLogger(__name__)
 
-MAX_STEPS = 65535  # 16 bits
+MAX_DEPTH_STEPS = 65535  # 16 bits
 # Below this number of steps, rounding to a step is an error of more than 0.2 % of the largest depth.
-MIN_USEFUL_STEPS = 256
-_UNIT_DIGITS = 2
+MIN_USEFUL_DEPTH_STEPS = 256
+_SUGGESTED_UNIT_DIGITS = 2
 
 
 class GeometryWriter:
@@ -79,13 +79,13 @@ class GeometryWriter:
         largest, unit = self.max_depth if max_depth is None else max_depth, self.config.depth_unit
         if self.config.depth != "png" or largest == 0:
             return
-        limit, smallest_unit = MAX_STEPS * unit, _round_up(largest / MAX_STEPS)
-        if largest >= (MAX_STEPS + 0.5) * unit:
+        limit, smallest_unit = MAX_DEPTH_STEPS * unit, _round_up(largest / MAX_DEPTH_STEPS)
+        if largest >= (MAX_DEPTH_STEPS + 0.5) * unit:
             _LOG.warning(
                 f"depths reach {largest:.4g} units, but 16-bit steps of {unit:g} units end at {limit:.4g}; pixels "
                 f"beyond are 0. Use `depth_unit={smallest_unit:g}`, or `depth='exr'`"
             )
-        elif largest < MIN_USEFUL_STEPS * unit:
+        elif largest < MIN_USEFUL_DEPTH_STEPS * unit:
             _LOG.warning(
                 f"depths reach only {largest:.4g} units, which are {largest / unit:.0f} steps of {unit:g} units. Use "
                 f"`depth_unit={smallest_unit:g}`, or `depth='exr'`"
@@ -110,7 +110,7 @@ def encode_depth(depth: np.ndarray, extension: str, unit: float) -> bytes:
         return _encode(Image.fromarray(depth.astype(np.float32)), "TIFF")
     steps = np.round(depth.astype(np.float64) / unit)
     steps = np.where(depth > 0, np.maximum(steps, 1), 0)
-    steps = np.where(steps <= MAX_STEPS, steps, 0).astype(np.uint16)
+    steps = np.where(steps <= MAX_DEPTH_STEPS, steps, 0).astype(np.uint16)
     text = PngInfo()
     text.add_text("Description", f"depth along the view axis; 1 step = {unit!r} world units; 0 = no surface")
     return _encode(Image.fromarray(steps), "PNG", pnginfo=text)
@@ -151,6 +151,6 @@ def _encode(image: Image.Image, kind: str, **options: object) -> bytes:
 
 
 def _round_up(value: float) -> float:
-    """Round a positive number up to _UNIT_DIGITS significant digits."""
-    digits = _UNIT_DIGITS - 1 - int(np.floor(np.log10(value)))
-    return float(f"{np.ceil(value * 10.0**digits) * 10.0**-digits:.{_UNIT_DIGITS}g}")
+    """Round a positive number up to _SUGGESTED_UNIT_DIGITS significant digits."""
+    digits = _SUGGESTED_UNIT_DIGITS - 1 - int(np.floor(np.log10(value)))
+    return float(f"{np.ceil(value * 10.0**digits) * 10.0**-digits:.{_SUGGESTED_UNIT_DIGITS}g}")

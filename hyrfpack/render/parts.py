@@ -75,12 +75,13 @@ def gather_geometry(model: MergedModel, camera: Camera, index: Tensor, decoded: 
     """
     frame, first, gaussians = camera_frame(model, camera), 0, []
     for part in model.parts:
-        some = index[(index >= first) & (index < first + len(part))]
-        geometry = part.decode_geometry(some - first) if decoded is None else decoded.geometry[some]
-        local = geometry.at(take_rows(part.gaussians.positions, some - first))
+        merged_index = index[(index >= first) & (index < first + len(part))]
+        part_index = merged_index - first
+        geometry = part.decode_geometry(part_index) if decoded is None else decoded.geometry[merged_index]
+        local = geometry.with_means(take_rows(part.gaussians.positions, part_index))
         if (sizes := part.gaussians.pixel_sizes) is not None:
             viewport = part.config.frame.local_viewport(camera, part.gaussians.positions.dtype)
-            local = widen_to_photos(local, sizes[some - first], viewport, antialiased=part.config.antialiased)
+            local = widen_to_photos(local, sizes[part_index], viewport, antialiased=part.config.antialiased)
         gaussians.append(_to_frame(local, part.config.frame, frame))
         first += len(part)
     return Gaussians3D(*(torch.cat(values) for values in zip(*gaussians, strict=True)))
@@ -134,10 +135,10 @@ def camera_frame(model: MergedModel, camera: Camera) -> Frame:
     return Frame((x, y, z), model.scene.config.frame.scale, (1.0, 1.0, 1.0), (w, i, j, k))
 
 
-def _to_frame(gaussians: Gaussians3D, own: Frame, frame: Frame) -> Gaussians3D:
-    """Return Gaussians in the local units of another frame than their own."""
-    turn = frame.axes.T @ own.axes
-    factor, offset = own.scale / frame.scale, frame.to_local(np.array([own.center]))[0]
+def _to_frame(gaussians: Gaussians3D, source: Frame, target: Frame) -> Gaussians3D:
+    """Return Gaussians, given in local units of the frame `source`, in local units and axes of the frame `target`."""
+    turn = target.axes.T @ source.axes
+    factor, offset = source.scale / target.scale, target.to_local(np.array([source.center]))[0]
     rotation = tensor_like((factor * turn).tolist(), gaussians.means)
     turned_basis = multiply_quats(quaternion_from_matrix(turn), np.eye(4))
     return Gaussians3D(

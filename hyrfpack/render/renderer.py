@@ -203,7 +203,7 @@ def render_view(
             if (sizes := model.gaussians.pixel_sizes) is not None:
                 gaussians = widen_to_photos(gaussians, sizes[index], viewport, antialiased=model.config.antialiased)
         gradients = positions.new_zeros(len(index), 2) if absgrad else None
-        raster_settings = raster_settings_of(model, settings, depth)
+        raster_settings = make_raster_settings(model, settings, depth)
         is_shaded = isinstance(colors, Shading)  # and has no gradients
         raster = rasterize(
             gaussians, colors, raster_viewport, raster_settings, absgrad=None if is_shaded else gradients, used=used,
@@ -246,7 +246,7 @@ def render_view(
     )
 
 
-def raster_settings_of(
+def make_raster_settings(
     model: HybridModel | MergedModel, settings: RenderSettings, depth: bool = False
 ) -> RasterSettings:
     """Return the settings with which `render_view` rasterises a model in the local units of its frame."""
@@ -301,7 +301,13 @@ def _select_gaussians(
     has_residuals = model.gaussians.color_residuals is not None
     is_shaded_by_kernel = positions.is_cuda and known_colors is None and not has_residuals
     if decoded is not None and shading is not None and is_shaded_by_kernel:
-        return torch.arange(len(model), device=positions.device), decoded.geometry.at(positions), shading, None, None
+        return (
+            torch.arange(len(model), device=positions.device),
+            decoded.geometry.with_means(positions),
+            shading,
+            None,
+            None,
+        )
     used, demand = None, None
     with add_seconds(seconds, "cull"), torch.no_grad():
         frustum = positions, viewport, settings.near, settings.cull_tolerance
@@ -315,7 +321,7 @@ def _select_gaussians(
             colors = model.decode_colors(_viewpoint(viewport, positions), index, shading, used)
         else:
             colors = known_colors[index]
-        return index, geometry.at(take_rows(positions, index, used)), colors, used, demand
+        return index, geometry.with_means(take_rows(positions, index, used)), colors, used, demand
 
 
 def _viewpoint(viewport: Viewport, positions: Tensor) -> Tensor:

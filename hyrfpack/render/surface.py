@@ -13,7 +13,7 @@ from hyrfpack.ops.rasterize.reference import quats_to_rotations
 from hyrfpack.parallel.pool import torch_on_one_thread
 from hyrfpack.render.depth_normals import normals_from_depth, unit_rays
 from hyrfpack.render.parts import camera_frame, gather_geometry
-from hyrfpack.render.renderer import RenderSettings, raster_settings_of
+from hyrfpack.render.renderer import RenderSettings, make_raster_settings
 from hyrfpack.render.sampling import widen_to_photos
 from hyrfpack.scene import Camera
 
@@ -39,7 +39,7 @@ def render_median_depth(
         settings: render settings.
     """
     gaussians, frame = drawn_gaussians(model, camera, decoded, index)
-    return _median_depth_in_frame(gaussians, frame, camera, raster_settings_of(model, settings))
+    return _median_depth_in_frame(gaussians, frame, camera, make_raster_settings(model, settings))
 
 
 def drawn_gaussians(
@@ -48,7 +48,7 @@ def drawn_gaussians(
     """Return Gaussians as `render_view` draws them, sampled no more finely than the photos did, and their frame."""
     if isinstance(model, MergedModel):
         return gather_geometry(model, camera, index, decoded), camera_frame(model, camera)
-    gaussians, frame = decoded.geometry[index].at(model.gaussians.positions[index]), model.config.frame
+    gaussians, frame = decoded.geometry[index].with_means(model.gaussians.positions[index]), model.config.frame
     if (sizes := model.gaussians.pixel_sizes) is None:
         return gaussians, frame
     viewport = frame.local_viewport(camera, gaussians.means.dtype)

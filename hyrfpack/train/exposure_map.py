@@ -154,8 +154,8 @@ def _solve(
     exposure: ExposureMap, positions: np.ndarray, directions: np.ndarray, gains: np.ndarray, ridge: float
 ) -> ExposureMap:
     """Return the map with the mean and weights that minimise the penalised error, given its centres as stored."""
-    camera_kernel = exposure.kernel_at(positions, directions)
-    center_kernel = exposure.kernel_of_centers()
+    camera_kernel = exposure.evaluate_kernel(positions, directions)
+    center_kernel = exposure.evaluate_center_kernel()
     count = len(center_kernel)
     design = np.column_stack((np.ones(len(gains)), camera_kernel))
     penalty = np.zeros((count + 1, count + 1))

@@ -26,7 +26,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.ops.transfer import HostCopy
 from hyrfpack.out_of_memory import explain_out_of_memory, has_run_out_of_memory
-from hyrfpack.parallel.pool import freed_memory_kept, torch_on_one_thread
+from hyrfpack.parallel.pool import keep_freed_memory, torch_on_one_thread
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import StepEvent, ignore_progress
 from hyrfpack.scene import Picture, Scene, View
@@ -199,7 +199,7 @@ class Trainer:
         with (
             closing(self.cache.stream(self._order())) as views,
             torch_on_one_thread(),
-            freed_memory_kept(),
+            keep_freed_memory(),
             self._captured_steps(),
         ):
             while self.step < self.steps:

@@ -21,7 +21,7 @@ def cloud_in_view(offset: float = 0.0) -> tuple[Gaussians3D, Viewport]:
     """Return Gaussians around a point beside the origin, and the camera's viewport."""
     positions = np.random.default_rng(0).normal(offset, 0.4, (200, 3))
     model = small_model(positions, fields=0.3).requires_grad_(False)
-    gaussians = model.decode_geometry().at(model.gaussians.positions)
+    gaussians = model.decode_geometry().with_means(model.gaussians.positions)
     return gaussians, model.config.frame.local_viewport(RING_CAMERA)
 
 

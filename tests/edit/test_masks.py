@@ -37,7 +37,7 @@ def masks(scene, is_object, tmp_path_factory) -> Path:
     """Return a folder of masks of the object: where the whole model shows the light of its Gaussians."""
     folder = tmp_path_factory.mktemp("masks")
     model = load_model(DEMO_MODEL_FILE)
-    gaussians = model.decode_geometry().at(model.gaussians.positions)
+    gaussians = model.decode_geometry().with_means(model.gaussians.positions)
     colors = torch.from_numpy(is_object).float()[:, None].expand(-1, 3).contiguous()
     for view in scene.train:
         viewport = model.config.frame.local_viewport(view.camera)

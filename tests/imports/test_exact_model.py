@@ -20,7 +20,7 @@ from hyrfpack.imports import ImportReport, import_loaded_splats, pack
 from hyrfpack.imports.exact_model import exact_model
 from hyrfpack.imports.prepare import prepare_model
 from hyrfpack.model.residuals import add_shape_residuals
-from hyrfpack.model.shape_residuals import shape_residuals
+from hyrfpack.model.shape_residuals import compute_shape_residuals
 from hyrfpack.render import render_view
 from hyrfpack.splats import viewpoints
 from hyrfpack.splats.draw import Drawable, draw
@@ -41,7 +41,7 @@ def test_shape_residuals_give_any_gaussian_its_covariance_whatever_the_field_pre
     raw = torch.from_numpy(rng.normal(size=(500, 8)))
     sizes = torch.from_numpy(np.log(scales / (1 - scales)))  # scale_bounds are 1
 
-    residuals, explicit = shape_residuals(raw, sizes, torch.from_numpy(quats))
+    residuals, explicit = compute_shape_residuals(raw, sizes, torch.from_numpy(quats))
 
     outputs = add_shape_residuals(raw, residuals).numpy()
     found_scales = 1 / (1 + np.exp(-(outputs[:, 1:4] + explicit.numpy())))

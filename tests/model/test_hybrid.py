@@ -227,12 +227,12 @@ def test_a_gaussian_at_the_viewpoint_has_a_finite_colour_and_gradient():
 
 def test_fields_evaluated_in_blocks_have_the_same_values(monkeypatch):
     model = random_model()
-    outputs, shading = model.geometry_outputs(), model.shading()
+    outputs, shading = model.geometry_outputs(), model.compute_shading()
 
     monkeypatch.setattr(hybrid, "GAUSSIANS_PER_FIELD_BLOCK", {"cpu": 7})
 
     torch.testing.assert_close(model.geometry_outputs(), outputs)
-    torch.testing.assert_close(model.shading().first_layer, shading.first_layer)
+    torch.testing.assert_close(model.compute_shading().first_layer, shading.first_layer)
 
 
 def test_an_empty_model_decodes_to_nothing():

@@ -118,7 +118,7 @@ def test_a_c_library_with_a_limit_keeps_as_much_memory_as_it_allows(monkeypatch:
             return 1
 
     monkeypatch.setattr(pool, "_c_library", OldLibrary)
-    with pool.freed_memory_kept():
+    with pool.keep_freed_memory():
         assert thresholds == [limit]
     assert thresholds == [limit, 1 << 20]
 
@@ -126,7 +126,7 @@ def test_a_c_library_with_a_limit_keeps_as_much_memory_as_it_allows(monkeypatch:
 MEMORY_SCRIPT = """
 import os
 import torch
-from hyrfpack.parallel.pool import freed_memory_kept
+from hyrfpack.parallel.pool import keep_freed_memory
 
 def resident_bytes():
     return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -135,7 +135,7 @@ def allocate_and_free():
     blocks = [torch.ones(2_500_000) for _ in range(20)]  # 10 MB each
 
 before = resident_bytes()
-with freed_memory_kept():
+with keep_freed_memory():
     allocate_and_free()
     kept = resident_bytes() - before
 print(kept, resident_bytes() - before)

@@ -163,9 +163,9 @@ def test_mixed_precision_that_fails_alone_leaves_the_float32_kernels(gpu, monkey
         "instead, as with `precision='float32'`"
     )
     model = small_model([(0, 0, 0)]).to(gpu)
-    assert not replaced_operations() & set(GPU_OPERATIONS) and not model.shading().mixed
+    assert not replaced_operations() & set(GPU_OPERATIONS) and not model.compute_shading().mixed
     set_replaced_operations([])
-    assert model.shading().mixed
+    assert model.compute_shading().mixed
 
 
 def stored_result(rows: object) -> str:

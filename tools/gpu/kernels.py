@@ -195,7 +195,7 @@ def _shadings(model: HybridModel) -> dict[str, Shading]:
     shadings = {}
     for precision in ("float32", "mixed"):  # "mixed" is the default, so the model ends in its initial precision
         model.precision = precision
-        shading = model.shading()
+        shading = model.compute_shading()
         shadings["mixed" if shading.mixed else "float32"] = shading
     return shadings
 

@@ -186,7 +186,7 @@ def render_depths(source: Source, camera: Camera) -> dict[str, np.ndarray]:
         index = rendered.indices[rendered.visible]
         planes = render_median_depth(model, camera, decoded, index, RenderSettings())
         viewport = model.config.frame.local_viewport(camera)
-        gaussians = decoded.geometry[index].at(model.gaussians.positions[index])
+        gaussians = decoded.geometry[index].with_means(model.gaussians.positions[index])
         settings = RasterSettings(antialiased=model.config.antialiased)
         flat = torch.zeros_like(gaussians.means)
         centers = cpu.median_depth(gaussians, flat, MAX_PLANE_DEPTH_RATIO, viewport, settings)

@@ -76,7 +76,7 @@ def mlp(
     return y if used is None else clear_unused_rows(y, used)
 
 
-def _halves(parameters: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+def _split_parameters(parameters: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
     """Split the parameters into weights and biases."""
     layers = len(parameters) // 2
     return parameters[:layers], parameters[layers:]
@@ -89,7 +89,7 @@ class _CpuMlp(torch.autograd.Function):
     def forward(ctx, x: Tensor, has_gradients: bool, *parameters: Tensor) -> Tensor:
         from hyrfpack.ops.mlp import cpu
 
-        weights, biases = _halves(parameters)
+        weights, biases = _split_parameters(parameters)
         # needs_input_grad is True for parameters even where no gradients are recorded.
         hidden = cpu.allocate_hidden(len(x), weights) if has_gradients and any(ctx.needs_input_grad) else []
         ctx.save_for_backward(x, *parameters)
@@ -103,7 +103,7 @@ class _CpuMlp(torch.autograd.Function):
 
         x, *parameters = ctx.saved_tensors
         needs_x = ctx.needs_input_grad[0]
-        grad_x, grad_weights, grad_biases = cpu.backward(x, *_halves(parameters), ctx.hidden, grad, needs_x)
+        grad_x, grad_weights, grad_biases = cpu.backward(x, *_split_parameters(parameters), ctx.hidden, grad, needs_x)
         return grad_x, None, *grad_weights, *grad_biases
 
 
