@@ -85,8 +85,8 @@ def camera_rays(viewport: Viewport, stride: int) -> tuple[tuple[float, ...], ...
     """Return the first node's ray, its increments per column and per row, and the origin, as tuples of 3 numbers."""
     fx, fy, cx, cy = viewport.intrinsics
     pose = viewport.pose.detach().cpu().double()
-    seen = [[(0.5 - cx) / fx, (0.5 - cy) / fy, 1], [stride / fx, 0, 0], [0, stride / fy, 0]]
-    rays = torch.tensor(seen, dtype=torch.float64) @ pose[:3, :3]
+    in_camera = [[(0.5 - cx) / fx, (0.5 - cy) / fy, 1], [stride / fx, 0, 0], [0, stride / fy, 0]]
+    rays = torch.tensor(in_camera, dtype=torch.float64) @ pose[:3, :3]
     return tuple(map(tuple, (*rays.tolist(), camera_center(pose).tolist())))
 
 
@@ -134,7 +134,7 @@ def background_grid(
     nodes = torch.nonzero(light.reshape(-1) > threshold).squeeze(-1)
     colors = transmittance.new_zeros(rows * columns, 3)
     if len(nodes):
-        places = torch.stack((nodes % columns, torch.div(nodes, columns, rounding_mode="floor")), dim=-1)
-        points = places.to(transmittance.dtype) * stride + 0.5
+        columns_and_rows = torch.stack((nodes % columns, torch.div(nodes, columns, rounding_mode="floor")), dim=-1)
+        points = columns_and_rows.to(transmittance.dtype) * stride + 0.5
         colors = colors.index_put((nodes,), background_colors(points, viewport, field))
     return colors.T.reshape(3, rows, columns).permute(1, 2, 0)

@@ -64,7 +64,7 @@ def rasterize(
     gaussians: Gaussians3D, colors: Tensor, viewport: Viewport, settings: RasterSettings, absgrad: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor, int, dict[str, float]]:
     """Compute `hyrfpack.ops.rasterize.rasterize`; the result is a tuple of the fields of `Rasterization` in order."""
-    view = _view(viewport, settings, None if absgrad is None else absgrad.detach())
+    view = _make_view(viewport, settings, None if absgrad is None else absgrad.detach())
     report: dict = {}
     rgb, transmittance, depths, visible = _Rasterize.apply(*gaussians, colors, view, report)
     return rgb, transmittance, depths, visible, report["pairs"], report["seconds"]
@@ -73,7 +73,7 @@ def rasterize(
 @torch.no_grad()
 def sum_blend_weights(gaussians: Gaussians3D, viewport: Viewport, settings: RasterSettings) -> tuple[Tensor, Tensor]:
     """Compute `hyrfpack.ops.rasterize.blend_weights.sum_blend_weights`."""
-    view = _view(viewport, settings)
+    view = _make_view(viewport, settings)
     means, quats, scales, opacities = (tensor.detach().contiguous().numpy() for tensor in gaussians)
     projection = _project(GaussianArrays(means, quats, scales, opacities, means), view)  # Colours are not used.
     tiles = _bin_pairs(cpu_bin.sort_by_depth(projection.keys), projection, view)
@@ -94,7 +94,7 @@ def median_depth(
         slopes: (N, 3) slopes dz/dx and dz/dy of each Gaussian's plane; the third column is not used.
         max_ratio: limit of a depth in the plane relative to the depth of the centre.
     """
-    view = _view(viewport, settings)
+    view = _make_view(viewport, settings)
     arrays = GaussianArrays(*(tensor.detach().contiguous().numpy() for tensor in (*gaussians, slopes)))
     projection = _project(arrays, view)
     tiles = _bin_pairs(cpu_bin.sort_by_depth(projection.keys), projection, view)
@@ -108,7 +108,7 @@ def median_depth(
     return torch.from_numpy(depth)
 
 
-def _view(viewport: Viewport, settings: RasterSettings, absgrad: Tensor | None = None) -> _View:
+def _make_view(viewport: Viewport, settings: RasterSettings, absgrad: Tensor | None = None) -> _View:
     """Convert the arguments of `rasterize` that get no gradients to the types that the kernels take."""
     camera = viewport.pose.detach().double().tolist()[:3]
     projection = ProjectionSettings(
@@ -136,19 +136,19 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx, means, quats, scales, opacities, colors, view, report):
         inputs = tuple(tensor.contiguous() for tensor in (means, quats, scales, opacities, colors))
         arrays = GaussianArrays(*(tensor.detach().numpy() for tensor in inputs))
-        clock = [perf_counter()]
+        times = [perf_counter()]
         projection = _project(arrays, view)
-        clock.append(perf_counter())
+        times.append(perf_counter())
         order = cpu_bin.sort_by_depth(projection.keys)
-        clock.append(perf_counter())
+        times.append(perf_counter())
         tiles = _bin_pairs(order, projection, view)
-        clock.append(perf_counter())
+        times.append(perf_counter())
         rgb, transmittance, depths, blended = _blend(tiles, view)
-        clock.append(perf_counter())
+        times.append(perf_counter())
 
         report["pairs"] = len(tiles.pairs)
         report["seconds"] = {
-            stage: clock[i + 1] - clock[i] for i, stage in enumerate(("project", "sort", "bin", "blend"))
+            stage: times[i + 1] - times[i] for i, stage in enumerate(("project", "sort", "bin", "blend"))
         }
         visible = torch.from_numpy(tiles.slot_starts[1:] > tiles.slot_starts[:-1])
         rgb, transmittance = torch.from_numpy(rgb), torch.from_numpy(transmittance)
@@ -205,7 +205,7 @@ def _bin_pairs(order: np.ndarray, projection: Projection, view: _View) -> _Tiles
     chunk_pairs: list = [None] * chunks
     pair_count = 0
 
-    def find(chunk: int) -> None:
+    def find_chunk_pairs(chunk: int) -> None:
         nonlocal pair_count
         if pair_count >= cpu_bin.MAX_PAIRS:  # Further pairs would only take memory.
             raise _too_many_pairs()
@@ -215,7 +215,7 @@ def _bin_pairs(order: np.ndarray, projection: Projection, view: _View) -> _Tiles
         )  # fmt: skip
         pair_count += len(chunk_pairs[chunk][0])
 
-    run_tasks(find, chunks)
+    run_tasks(find_chunk_pairs, chunks)
     np.cumsum(slot_starts, out=slot_starts)
     starts = np.empty(tile_total + 1, np.int64)
     cpu_bin.assign_chunk_offsets(tile_counts, starts)
@@ -223,12 +223,12 @@ def _bin_pairs(order: np.ndarray, projection: Projection, view: _View) -> _Tiles
         raise _too_many_pairs()
     pairs = np.empty(slot_starts[-1], np.uint64)
 
-    def fill(chunk: int) -> None:
+    def fill_chunk_pairs(chunk: int) -> None:
         cpu_bin.fill_tiles(
             edges[chunk], edges[chunk + 1], order, slot_starts, *chunk_pairs[chunk], tile_counts[chunk], pairs
         )
 
-    run_tasks(fill, chunks)
+    run_tasks(fill_chunk_pairs, chunks)
     return _Tiles(sorted_records, slot_starts, starts, pairs)
 
 

@@ -28,7 +28,7 @@ def median_tiles(first_tile, last_tile, tile_starts, pairs, records, max_ratio, 
     """
     height, width = depth.shape
     pixel_x, pixel_y = np.empty(_PIXELS_PER_TILE, np.float32), np.empty(_PIXELS_PER_TILE, np.float32)
-    light, found = np.empty(_PIXELS_PER_TILE, np.float32), np.empty(_PIXELS_PER_TILE, np.float32)
+    transmittance, median = np.empty(_PIXELS_PER_TILE, np.float32), np.empty(_PIXELS_PER_TILE, np.float32)
     for k in range(_PIXELS_PER_TILE):
         pixel_x[k], pixel_y[k] = np.float32(k % TILE_SIZE) + _HALF, np.float32(k // TILE_SIZE) + _HALF
     tiles_x = (width + TILE_SIZE - 1) // TILE_SIZE
@@ -37,7 +37,7 @@ def median_tiles(first_tile, last_tile, tile_starts, pairs, records, max_ratio, 
         columns, lines = min(TILE_SIZE, width - left), min(TILE_SIZE, height - top)
         for k in range(np.uint64(_PIXELS_PER_TILE)):
             inside = (k & _UINT_15) < np.uint64(columns) and k // _ROW_PIXELS < np.uint64(lines)
-            light[k], found[k] = _ONE if inside else _ZERO, _ZERO
+            transmittance[k], median[k] = _ONE if inside else _ZERO, _ZERO
         begin, end = np.uint64(tile_starts[tile]), np.uint64(tile_starts[tile + 1])
         for pair in range(begin, end):
             packed = pairs[pair]
@@ -58,17 +58,17 @@ def median_tiles(first_tile, last_tile, tile_starts, pairs, records, max_ratio, 
                 x = -(u * u + v * v)
                 alpha = min(opacity * exp8(x), _ALPHA_MAX)
                 alpha = alpha if x >= cut else _ZERO
-                before = light[k]
+                before = transmittance[k]
                 after = before - alpha * before
-                light[k] = after
+                transmittance[k] = after
                 z = min(max(z_0 + slope_x * pixel_x[k] + slope_y * pixel_y[k], low), high)
-                found[k] = z if before > _HALF and after <= _HALF else found[k]
+                median[k] = z if before > _HALF and after <= _HALF else median[k]
             if (pair - begin) & _FINISH_TEST_MASK == _FINISH_TEST_MASK:
                 unfinished = _ZERO
                 for k in range(np.uint64(_PIXELS_PER_TILE)):
-                    unfinished += max(light[k] - _HALF, _ZERO)
+                    unfinished += max(transmittance[k] - _HALF, _ZERO)
                 if unfinished == _ZERO:
                     break
         for row in range(lines):
             for column in range(columns):
-                depth[top + row, left + column] = found[row * TILE_SIZE + column]
+                depth[top + row, left + column] = median[row * TILE_SIZE + column]

@@ -76,9 +76,9 @@ def project(gaussians: Gaussians3D, viewport: Viewport, settings: RasterSettings
     # Far from the origin R m and t are large and cancel, so float64 is used where it exists (Apple's GPUs have none).
     exact = torch.float32 if means.device.type == "mps" else torch.float64
     camera = viewport.pose.to(exact).to(means.device)
-    seen = means.to(exact) @ camera[:3, :3].T + camera[:3, 3]
-    index = torch.nonzero(seen[:, 2] > settings.near)[:, 0]
-    x, y, z = seen[index].to(means.dtype).unbind(-1)
+    in_camera = means.to(exact) @ camera[:3, :3].T + camera[:3, 3]
+    index = torch.nonzero(in_camera[:, 2] > settings.near)[:, 0]
+    x, y, z = in_camera[index].to(means.dtype).unbind(-1)
     x_z, y_z = x / z, y / z
     axes = camera[:3, :3].to(means.dtype) @ quats_to_rotations(quats[index]) * scales[index, None, :]
     half = _projection_jacobian(x_z, y_z, z, viewport) @ axes

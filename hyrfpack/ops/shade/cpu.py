@@ -25,7 +25,7 @@ def shade(positions: Tensor, viewpoint: Tensor, shading: Shading, index: Tensor 
     colors = torch.empty(total, 3)
     (w2, w3), (b2, b3) = shading.weights, shading.biases
 
-    def task(chunk: int) -> None:
+    def shade_chunk(chunk: int) -> None:
         chunk_slice = slice(chunk * _GAUSSIANS_PER_CHUNK, min(total, (chunk + 1) * _GAUSSIANS_PER_CHUNK))
 
         def take(values: Tensor) -> Tensor:
@@ -39,5 +39,5 @@ def shade(positions: Tensor, viewpoint: Tensor, shading: Shading, index: Tensor 
             torch.sigmoid(logits, out=colors[chunk_slice])
 
     with torch_on_one_thread():
-        run_tasks(task, -(-total // _GAUSSIANS_PER_CHUNK))
+        run_tasks(shade_chunk, -(-total // _GAUSSIANS_PER_CHUNK))
     return colors
