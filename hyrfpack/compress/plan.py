@@ -61,8 +61,9 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, p
     jobs: dict[str, Callable[[], Any]] = {COLORS: lambda: color_basis(to_arrays(model)[COLORS][kept])}
     for group in (*TABLE_SECTIONS, *DECODER_SECTIONS):
         jobs[group] = partial(build_step_groups, group, model.config, layers[0].points)
-    done = run_jobs(jobs)
-    return Plan(kept, layers, done.pop(COLORS), done, per_number, len(model))
+    groups = run_jobs(jobs)
+    basis = groups.pop(COLORS)
+    return Plan(kept, layers, basis, groups, per_number, len(model))
 
 
 def distortion_per_number(model: HybridModel, distortion: float) -> float:

@@ -112,14 +112,14 @@ def quantize(
                 d,
                 reach,
             )
-    done = run_jobs(jobs)
+    quantized = run_jobs(jobs)
     channels = [
-        {group: [done[f"{group} {layer} {column}"] for column in range(LOGIT_COLUMNS[group])] for group in logits}
+        {group: [quantized[f"{group} {layer} {column}"] for column in range(LOGIT_COLUMNS[group])] for group in logits}
         for layer in range(len(plan.layers))
     ]
     layers = range(len(plan.layers)) if residuals else ()
-    quantized_residuals = [{group: done[f"{group} {layer}"] for group in residuals} for layer in layers]
-    groups = {group: done[group] for group in plan.groups if group in sections}
+    quantized_residuals = [{group: quantized[f"{group} {layer}"] for group in residuals} for layer in layers]
+    groups = {group: quantized[group] for group in plan.groups if group in sections}
     return QuantizedModel(plan, channels, groups, quantized_residuals)
 
 

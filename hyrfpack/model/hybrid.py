@@ -25,8 +25,9 @@ from hyrfpack.ops.viewport import Viewport
 from hyrfpack.parallel.pool import parallel_map
 
 # Without gradients, fields are evaluated for this many Gaussians at a time, which bounds the memory of hash features.
+GAUSSIANS_PER_BLOCK = 1 << 18
 # On the CPU one thread evaluates a block, and each thread should get several.
-GAUSSIANS_PER_FIELD_BLOCK = {"cpu": 1 << 15, "cuda": 1 << 18}
+GAUSSIANS_PER_CPU_BLOCK = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -183,7 +184,9 @@ class HybridModel(nn.Module):
         first = weight.new_empty(len(self), len(bias), dtype=torch.bfloat16 if self._mixed else None)
 
         def evaluate(positions: Tensor) -> Tensor:
-            return mlp(field.grid(self.cube_coords(positions)), [weight[:, :position_inputs]], [bias], mixed=self._mixed)
+            return mlp(
+                field.grid(self.cube_coords(positions)), [weight[:, :position_inputs]], [bias], mixed=self._mixed
+            )
 
         return Shading(
             self._fill_blocks(first, evaluate),
@@ -204,11 +207,15 @@ class HybridModel(nn.Module):
         )
 
     def _fill_blocks(self, rows: Tensor, evaluate: Callable[[Tensor], Tensor]) -> Tensor:
-        """Write the function of the positions of all Gaussians to `rows` (N, ...), block by block; return them."""
-        positions, count = self.gaussians.positions, GAUSSIANS_PER_FIELD_BLOCK.get(rows.device.type, 1 << 18)
-        blocks = list(zip(positions.split(count), rows.split(count), strict=True))
-        fill = torch.no_grad()(lambda block: block[1].copy_(evaluate(block[0])))
-        parallel_map(fill, blocks, rows.device)
+        """Write a function of the positions of all Gaussians to `rows` (N, ...), block by block; return the rows."""
+        count = GAUSSIANS_PER_CPU_BLOCK if rows.device.type == "cpu" else GAUSSIANS_PER_BLOCK
+
+        @torch.no_grad()  # gradient mode is kept per thread
+        def fill(start: int) -> None:
+            block = slice(start, start + count)
+            rows[block] = evaluate(self.gaussians.positions[block])
+
+        parallel_map(fill, range(0, len(rows), count), rows.device)
         return rows
 
     @torch.no_grad()
@@ -223,16 +230,15 @@ class HybridModel(nn.Module):
         geometry = Geometry(
             outputs.new_empty(len(self), 3), outputs.new_empty(len(self), 4), outputs.new_empty(len(self))
         )
-        count = GAUSSIANS_PER_FIELD_BLOCK["cpu"]
 
-        @torch.no_grad()
+        @torch.no_grad()  # gradient mode is kept per thread
         def fill(start: int) -> None:
-            rows = slice(start, start + count)
-            block = self.activate(*(values[rows] for values in inputs))
-            geometry.scales[rows], geometry.quats[rows] = block.scales, block.quats
-            geometry.opacities[rows] = block.opacities
+            block = slice(start, start + GAUSSIANS_PER_CPU_BLOCK)
+            activated = self.activate(*(values[block] for values in inputs))
+            geometry.scales[block], geometry.quats[block] = activated.scales, activated.quats
+            geometry.opacities[block] = activated.opacities
 
-        parallel_map(fill, range(0, len(self), count))
+        parallel_map(fill, range(0, len(self), GAUSSIANS_PER_CPU_BLOCK))
         return geometry
 
     def decode_geometry(self, index: Tensor | None = None, used: Tensor | None = None) -> Geometry:

@@ -229,7 +229,7 @@ def test_fields_evaluated_in_blocks_have_the_same_values(monkeypatch):
     model = random_model()
     outputs, shading = model.geometry_outputs(), model.compute_shading()
 
-    monkeypatch.setattr(hybrid, "GAUSSIANS_PER_FIELD_BLOCK", {"cpu": 7})
+    monkeypatch.setattr(hybrid, "GAUSSIANS_PER_CPU_BLOCK", 7)
 
     torch.testing.assert_close(model.geometry_outputs(), outputs)
     torch.testing.assert_close(model.compute_shading().first_layer, shading.first_layer)
