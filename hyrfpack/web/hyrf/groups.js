@@ -20,7 +20,7 @@ import { FIXED_POINT_ONE, STEP_BY_CODE } from "./steps.js";
 
 const GROUP_MODEL_COUNT = 8;
 const MAX_ABS_SYMBOL = 2 ** 24;
-const USE_CLASSES_PER_LEVEL = 16;
+const USAGE_CLASSES_PER_LEVEL = 16;
 const MAX_COUNTED_POINTS = 65536; // in larger layers only every n-th point is counted, to bound the time
 
 /**
@@ -59,10 +59,10 @@ export const tableGroups = (grid, points) => {
     countUses(level, points, uses);
     for (let row = 0; row < level.rows; row++) {
       const digits = 32 - Math.clz32(uses[row]);
-      index[level.first + row] = USE_CLASSES_PER_LEVEL * k + ((digits + 1) >> 1);
+      index[level.first + row] = USAGE_CLASSES_PER_LEVEL * k + ((digits + 1) >> 1);
     }
   });
-  return { index, count: USE_CLASSES_PER_LEVEL * levels.length, width: FEATURES_PER_ROW };
+  return { index, count: USAGE_CLASSES_PER_LEVEL * levels.length, width: FEATURES_PER_ROW };
 };
 
 /**
@@ -96,13 +96,13 @@ const countUses = ({ resolution, rows, dense }, { centers, count }, uses) => {
 export const readTableGroups = (data, grid) => {
   assertValid(data.length >= 4, "it ends within its header");
   const end = 4 + new DataView(data.buffer, data.byteOffset, 4).getUint32(0, true);
-  assertValid(end <= data.length, "its use classes do not fit its bytes");
+  assertValid(end <= data.length, "its usage classes do not fit its bytes");
   const rowLevels = new Uint8Array(tableRows(grid)), levels = gridLevels(grid);
   levels.forEach(({ first, rows }, level) => rowLevels.fill(level, first, first + rows));
   const classes = decodeIntegers(data.subarray(4, end), rowLevels.length, rowLevels, false);
-  assertValid(classes.every((use) => use < USE_CLASSES_PER_LEVEL), "a use class is out of range");
-  const index = Uint16Array.from(classes, (use, row) => USE_CLASSES_PER_LEVEL * rowLevels[row] + use);
-  const groups = { index, count: USE_CLASSES_PER_LEVEL * levels.length, width: FEATURES_PER_ROW };
+  assertValid(classes.every((usage) => usage < USAGE_CLASSES_PER_LEVEL), "a usage class is out of range");
+  const index = Uint16Array.from(classes, (usage, row) => USAGE_CLASSES_PER_LEVEL * rowLevels[row] + usage);
+  const groups = { index, count: USAGE_CLASSES_PER_LEVEL * levels.length, width: FEATURES_PER_ROW };
   return { groups, rest: data.subarray(end) };
 };
 
