@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from hyrfpack.errors import HyrfError as HyrfError
     from hyrfpack.errors import HyrfFormatError as HyrfFormatError
     from hyrfpack.errors import HyrfNoPosesError as HyrfNoPosesError
+    from hyrfpack.errors import HyrfSizeError as HyrfSizeError
     from hyrfpack.errors import HyrfTrainingError as HyrfTrainingError
     from hyrfpack.evaluate import Evaluation as Evaluation
     from hyrfpack.evaluate import evaluate_model as evaluate_model
@@ -143,6 +144,7 @@ _MODULES_BY_PUBLIC_NAME = {
     "HyrfError": "hyrfpack.errors",
     "HyrfFormatError": "hyrfpack.errors",
     "HyrfNoPosesError": "hyrfpack.errors",
+    "HyrfSizeError": "hyrfpack.errors",
     "HyrfTrainingError": "hyrfpack.errors",
     "Evaluation": "hyrfpack.evaluate",
     "evaluate_model": "hyrfpack.evaluate",
