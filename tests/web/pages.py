@@ -109,8 +109,8 @@ def rasterize_reference(
 ) -> np.ndarray:
     """Return the picture of our rasteriser, (H, W, 3) in 0 to 255."""
     raster = draw(Drawable.from_splats(splats, frame), camera)
-    behind = np.array(BACKGROUND_COLOR) if background is None else background
-    return np.clip(raster.rgb.numpy() + raster.transmittance.numpy()[..., None] * behind, 0, 1) * 255
+    background_color = np.array(BACKGROUND_COLOR) if background is None else background
+    return np.clip(raster.rgb.numpy() + raster.transmittance.numpy()[..., None] * background_color, 0, 1) * 255
 
 
 def sky_picture(camera: Camera) -> np.ndarray:

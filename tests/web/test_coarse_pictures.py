@@ -78,7 +78,7 @@ def test_a_coarse_picture_is_nearly_the_mean_over_blocks_of_the_fine_one(browser
     browser.evaluate("hyrfpack.player.settled.then(() => true)")
     fine = capture(browser, 1.0)
     height, width = fine.shape[:2]
-    for scale, least in MIN_PSNR_BY_SCALE.items():
+    for scale, min_psnr in MIN_PSNR_BY_SCALE.items():
         reduced = mean_over_blocks(fine, round(min(1, 2 * scale) * height), round(scale * width))
-        found = psnr(capture(browser, scale), enlarge(reduced, height, width))
-        assert found > least, (scale, found)
+        measured_psnr = psnr(capture(browser, scale), enlarge(reduced, height, width))
+        assert measured_psnr > min_psnr, (scale, measured_psnr)

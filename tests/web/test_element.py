@@ -113,8 +113,8 @@ def test_the_first_camera_is_that_of_the_attribute(browser: Browser, host: Site)
     moved = ",".join([str(float(text.split(",")[0]) + 0.25), *text.split(",")[1:]])
     open_element(browser, host, f"src='some scene.hyrf' camera='{moved}'")
     wait_until(browser, LOADED_JS)
-    found = browser.evaluate(f"{ELEMENT_JS}.viewer.cameraText")
-    assert float(found.split(",")[0]) == pytest.approx(float(moved.split(",")[0]), abs=1e-3)
+    shown = browser.evaluate(f"{ELEMENT_JS}.viewer.cameraText")
+    assert float(shown.split(",")[0]) == pytest.approx(float(moved.split(",")[0]), abs=1e-3)
 
 
 def test_a_camera_that_is_set_before_the_scene_is_loaded_is_the_first_one(browser: Browser, host: Site):
@@ -126,8 +126,8 @@ def test_a_camera_that_is_set_before_the_scene_is_loaded_is_the_first_one(browse
     )
     assert was_loading
     wait_until(browser, LOADED_JS)
-    found = browser.evaluate(f"{ELEMENT_JS}.viewer.cameraText").split(",")
-    assert [float(text) for text in found[:7]] == pytest.approx([0.5, 0.2, -3, 1, 0, 0, 0], abs=1e-3)
+    shown = browser.evaluate(f"{ELEMENT_JS}.viewer.cameraText").split(",")
+    assert [float(text) for text in shown[:7]] == pytest.approx([0.5, 0.2, -3, 1, 0, 0, 0], abs=1e-3)
 
 
 def test_a_failed_load_is_shown_as_one_sentence_over_the_poster(browser: Browser, host: Site):

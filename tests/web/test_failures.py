@@ -58,8 +58,8 @@ def test_a_page_that_names_no_scene_invites_to_open_one_after_a_failure_too(brow
     drop_file(browser, b"not a scene", "notes.txt")
     wait_for_message(browser)
     assert is_visible(browser, "invitation")
-    behind = browser.evaluate("getComputedStyle(document.getElementById('invitation')).backgroundColor")
-    assert float(re.findall(r"[\d.]+", behind)[-1]) > 0.85, "the text stands on the poster"
+    background = browser.evaluate("getComputedStyle(document.getElementById('invitation')).backgroundColor")
+    assert float(re.findall(r"[\d.]+", background)[-1]) > 0.85, "the text stands on the poster"
 
 
 def test_phones_are_asked_to_open_a_file_and_not_to_drop_one(browser: Browser, host: Site):

@@ -120,5 +120,5 @@ ARITHMETIC_PATTERN_BY_OWNER = {
 @pytest.mark.parametrize("owner", ARITHMETIC_PATTERN_BY_OWNER)
 def test_vectors_halves_harmonics_and_rotations_are_calculated_in_one_module_each(owner):
     paths = list_web_files("viewer", ".js") + list_web_files("hyrf", ".js")
-    found = [path for path in paths if re.search(ARITHMETIC_PATTERN_BY_OWNER[owner], read_web_file(path))]
-    assert found == [owner]
+    owners = [path for path in paths if re.search(ARITHMETIC_PATTERN_BY_OWNER[owner], read_web_file(path))]
+    assert owners == [owner]

@@ -103,17 +103,17 @@ def test_a_camera_that_was_set_is_read_back_and_reported(browser: Browser, site:
     wait_until(browser, READY_JS)
     browser.evaluate("window.moves = 0, viewer.on('camera', () => { window.moves++; }), 0")
     first = browser.evaluate("viewer.camera")
-    wanted = browser.evaluate(
+    chosen = browser.evaluate(
         "((camera) => { camera.camera_from_world[2][3] += 0.25; viewer.camera = camera; return camera; })"
         "(viewer.camera)"
     )
-    assert is_same_pose(browser.evaluate("viewer.camera"), wanted) and not is_same_pose(first, wanted)
+    assert is_same_pose(browser.evaluate("viewer.camera"), chosen) and not is_same_pose(first, chosen)
     wait_until(browser, "moves > 0")
     text = browser.evaluate("viewer.cameraText")
     browser.evaluate("(viewer.camera = 0, 0)")
-    assert not is_same_pose(browser.evaluate("viewer.camera"), wanted)
+    assert not is_same_pose(browser.evaluate("viewer.camera"), chosen)
     browser.evaluate(f"(viewer.camera = {text!r}, 0)")
-    assert is_same_pose(browser.evaluate("viewer.camera"), wanted)
+    assert is_same_pose(browser.evaluate("viewer.camera"), chosen)
 
 
 def test_move_to_glides_and_ends_at_the_camera(browser: Browser, site: Site):

@@ -8,7 +8,7 @@ import { FIXED_POINT_ONE, STEP_BY_CODE } from "./steps.js";
 /** @typedef {import("./lattice.js").LatticePoints} LatticePoints */
 
 const BASIS_BYTES = 36;
-const MAX_BASIS_ENTRY = 1 + 2 ** -10;
+const MAX_ABS_BASIS_ENTRY = 1 + 2 ** -10;
 const CHANNEL_HEADER_BYTES = 10;
 const MAX_ABS_MEAN = 4096;
 const MAX_PREDICTION_WEIGHT = 16;
@@ -31,7 +31,7 @@ export const decodeChannels = (data, points, columns) => {
     assertValid(data.length >= BASIS_BYTES, "it ends within its basis");
     const view = new DataView(data.buffer, data.byteOffset, BASIS_BYTES);
     for (let i = 0; i < 9; i++) basis[i] = view.getFloat32(4 * i, true);
-    assertValid(basis.every((number) => Math.abs(number) <= MAX_BASIS_ENTRY), "its basis is not orthonormal");
+    assertValid(basis.every((number) => Math.abs(number) <= MAX_ABS_BASIS_ENTRY), "its basis is not orthonormal");
     rest = data.subarray(BASIS_BYTES);
   }
   const channels = [];
@@ -62,8 +62,8 @@ const decodeChannel = (data, { classes, count }) => {
   const view = new DataView(data.buffer, data.byteOffset, data.length);
   const mean = view.getFloat32(0, true), weight = data[4], classCount = data[9];
   const start = CHANNEL_HEADER_BYTES + classCount, size = start + view.getUint32(5, true);
-  const isKnown = Math.abs(mean) <= MAX_ABS_MEAN && weight <= MAX_PREDICTION_WEIGHT;
-  assertValid(isKnown, "the header of a channel has invalid values");
+  const isInRange = Math.abs(mean) <= MAX_ABS_MEAN && weight <= MAX_PREDICTION_WEIGHT;
+  assertValid(isInRange, "the header of a channel has invalid values");
   assertValid(size <= data.length, "it ends within a channel");
   let largestClass = 0;
   for (let i = 0; i < count; i++) if (classes[i] > largestClass) largestClass = classes[i];

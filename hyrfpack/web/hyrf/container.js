@@ -16,7 +16,8 @@ const MAJOR_VERSION = 1;
 export const HEADER_BYTES = 48;
 export const ENTRY_BYTES = 40;
 export const MAX_SECTIONS = 1024;
-const MAX_FILE_BYTES = 2 ** 34; // limits a file and its decoded bytes
+/** The maximum length of a file, and of all its sections after decoding. */
+export const MAX_FILE_BYTES = 2 ** 34;
 // A file of n bytes may declare at most MAX_RAW_BYTES_PER_BYTE n + BASE_RAW_BYTES decoded bytes, so that a small file
 // cannot claim large memory.
 const MAX_RAW_BYTES_PER_BYTE = 1024;
@@ -61,7 +62,10 @@ for (let layer = 0; layer < MAX_LAYERS; layer++) {
   for (const type of [...LAYERED_TYPES, ...RESIDUAL_TYPES]) KNOWN_TYPES.add(layerType(type, layer));
 }
 
-/** @param {number} length */
+/**
+ * Rounds a length in bytes up to a multiple of 8, as sections are padded.
+ * @param {number} length
+ */
 const paddedLength = (length) => Math.ceil(length / 8) * 8;
 
 /** The sections of a file whose header and table of contents have been checked. */
@@ -138,11 +142,11 @@ export class Container {
     const flags = view.getUint32(12, true);
     if (flags) rejectNewer(`its header sets the flags 0x${flags.toString(16)}`);
     this.length = readUint64(view, 16);
-    const says = `its header says ${groupedDigits(this.length)} bytes and there are ${groupedDigits(available)}`;
+    const lengths = `its header says ${groupedDigits(this.length)} bytes and there are ${groupedDigits(available)}`;
     if (this.length > available && !partial) {
-      throw new HyrfFormatError(`The file is truncated: ${says}; fetch it again.`);
+      throw new HyrfFormatError(`The file is truncated: ${lengths}; fetch it again.`);
     }
-    if (this.length < available) rejectDamaged(says);
+    if (this.length < available) rejectDamaged(lengths);
     if (this.length > MAX_FILE_BYTES) rejectDamaged(`its header says ${groupedDigits(this.length)} bytes, too many`);
     const count = view.getUint32(36, true);
     if (count > MAX_SECTIONS) rejectDamaged(`its header says ${groupedDigits(count)} sections, too many`);
@@ -164,7 +168,7 @@ export class Container {
    * @param {DataView} table
    */
   checkEntries(table) {
-    let end = HEADER_BYTES + table.byteLength, promised = 0;
+    let end = HEADER_BYTES + table.byteLength, declared = 0;
     for (let at = 0; at < table.byteLength; at += ENTRY_BYTES) {
       const letters = [0, 1, 2, 3].map((i) => String.fromCharCode(table.getUint8(at + i)));
       const type = letters.join("");
@@ -180,11 +184,11 @@ export class Container {
       const codec = table.getUint16(at + 4, true), checksum = table.getUint32(at + 32, true);
       this.entries.set(type, { type, codec, offset, stored, raw, checksum, end });
       // Sections that are not available are not decoded, so their declared size takes no memory.
-      if (end <= this.bytes.length) promised += raw;
+      if (end <= this.bytes.length) declared += raw;
     }
     if (end !== this.length) rejectDamaged("its sections end elsewhere than the file");
     const limit = rawBytesLimit(this.bytes.length);
-    if (promised > limit) rejectDamaged(`its sections say they decode to ${groupedDigits(promised)} bytes, too many`);
+    if (declared > limit) rejectDamaged(`its sections say they decode to ${groupedDigits(declared)} bytes, too many`);
   }
 }
 
@@ -195,8 +199,9 @@ export class Container {
  * @returns {never}
  */
 export const rejectIncomplete = (container, needed) => {
-  const [least, all, available] = [needed, container.length, container.bytes.length].map(groupedDigits);
-  throw new HyrfFormatError(`The first ${least} of ${all} bytes make a model and ${available} are there; fetch more.`);
+  const [required, all, available] = [needed, container.length, container.bytes.length].map(groupedDigits);
+  const problem = `The first ${required} of ${all} bytes make a model and ${available} are there`;
+  throw new HyrfFormatError(`${problem}; fetch more.`);
 };
 
 /**

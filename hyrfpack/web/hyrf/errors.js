@@ -23,44 +23,45 @@ export class DamagedData extends Error {}
 
 /**
  * Throws the error for a damaged file.
- * @param {string} what the reason
+ * @param {string} reason
  * @returns {never}
  */
-export const rejectDamaged = (what) => {
-  throw new HyrfFormatError(`The file is damaged: ${what}; fetch or write it again.`);
+export const rejectDamaged = (reason) => {
+  throw new HyrfFormatError(`The file is damaged: ${reason}; fetch or write it again.`);
 };
 
 /**
  * Throws the error for a file that needs a newer reader.
- * @param {string} what the reason
+ * @param {string} reason
  * @returns {never}
  */
-export const rejectNewer = (what) => {
-  throw new HyrfFormatError(`The file is newer than this reader: ${what}; update the reader.`);
+export const rejectNewer = (reason) => {
+  throw new HyrfFormatError(`The file is newer than this reader: ${reason}; update the reader.`);
 };
 
 /**
- * Returns bytes that a caller passes. A Uint8Array of another frame is accepted, whose class is another one.
+ * Returns bytes that a caller passes. It also accepts a Uint8Array of another frame of the page, which is of another
+ * class.
  * @param {Uint8Array} value
- * @param {string} what the name of the file
+ * @param {string} name that of the bytes, for the message
  * @throws {TypeError} it is no Uint8Array
  */
-export const requireBytes = (value, what) => {
+export const requireBytes = (value, name) => {
   const type = Object.prototype.toString.call(value).slice(8, -1);
   if (type === "Uint8Array") return value;
-  throw new TypeError(`${what} must be a Uint8Array, not ${type}; pass new Uint8Array(await response.arrayBuffer()).`);
+  throw new TypeError(`${name} must be a Uint8Array, not ${type}; pass new Uint8Array(await response.arrayBuffer()).`);
 };
 
 /**
  * Throws DamagedData unless a condition holds.
  * @param {boolean} holds whether the condition holds
- * @param {string} what the reason
+ * @param {string} reason what is wrong if it does not hold
  */
-export const assertValid = (holds, what) => {
-  if (!holds) throw new DamagedData(what);
+export const assertValid = (holds, reason) => {
+  if (!holds) throw new DamagedData(reason);
 };
 
-// What browsers say of arrays that are too long, or for which there is no memory.
+// Messages of browsers for arrays that are too long, or for which there is no memory, match this.
 const MEMORY_MESSAGE = /alloc|length|memory|array size/i;
 
 /**

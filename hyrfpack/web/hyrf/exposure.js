@@ -70,18 +70,18 @@ export const logGains = ({ box, lengths, mean, limits, centers }, position, dire
   for (const center of centers) {
     let divisor = 1;
     for (const axis of AXES) {
-      const along = clampPair(position[axis], box, axis) - center.position[axis];
-      divisor += (along / lengths[0]) ** 2 + ((direction[axis] - center.direction[axis]) / lengths[1]) ** 2;
+      const offset = clampToBounds(position[axis], box, axis) - center.position[axis];
+      divisor += (offset / lengths[0]) ** 2 + ((direction[axis] - center.direction[axis]) / lengths[1]) ** 2;
     }
     for (const axis of AXES) logs[axis] += center.weight[axis] / divisor;
   }
-  return logs.map((value, axis) => clampPair(value, limits, axis));
+  return logs.map((value, axis) => clampToBounds(value, limits, axis));
 };
 
 /**
  * Clamps a value to the bounds of an axis.
  * @param {number} value
- * @param {Float32Array} pair 6 numbers: the lower bounds of three axes, then the upper bounds
+ * @param {Float32Array} bounds 6 numbers: the lower bounds of three axes, then the upper bounds
  * @param {number} axis
  */
-const clampPair = (value, pair, axis) => Math.min(Math.max(value, pair[axis]), pair[3 + axis]);
+const clampToBounds = (value, bounds, axis) => Math.min(Math.max(value, bounds[axis]), bounds[3 + axis]);

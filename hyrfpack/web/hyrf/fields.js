@@ -57,13 +57,13 @@ export function decodeGeometry(model, start, stop) {
     runLayer(geometry.first, geometry.features, geometry.first.inputs, false, rows, geometry.hidden);
     runLaterLayers(geometry, rows, outputs);
     for (let row = 0; row < rows; row++) {
-      const i = first + row, at = i - start, raw = row * geometry.last.stride, largest = grows ? radii[row] : 1;
+      const i = first + row, at = i - start, raw = row * geometry.last.stride, maxScale = grows ? radii[row] : 1;
       if (shapeResiduals) addShapeResiduals(outputs, raw, shapeResiduals, SHAPE_RESIDUALS * i);
       opacities[at] = sigmoid(outputs[raw] + opacityLogits[i]);
       for (let axis = 0; axis < 3; axis++) {
-        const neural = outputs[raw + 1 + axis], own = scaleLogits[i];
-        const part = rule === "sum" ? sigmoid(neural + own) : sigmoid(neural) * sigmoid(own);
-        scales[3 * at + axis] = largest * part;
+        const predicted = outputs[raw + 1 + axis], logit = scaleLogits[i];
+        const ratio = rule === "sum" ? sigmoid(predicted + logit) : sigmoid(predicted) * sigmoid(logit);
+        scales[3 * at + axis] = maxScale * ratio;
       }
       const w = outputs[raw + 4] + 1, x = outputs[raw + 5], y = outputs[raw + 6], z = outputs[raw + 7];
       const length = Math.sqrt(w * w + x * x + y * y + z * z);
@@ -198,12 +198,12 @@ function getPreparedFields(model) {
 /**
  * Arranges a field's decoder for `runLayer` and allocates its buffers.
  * @param {Model} model
- * @param {FieldName} which
+ * @param {FieldName} name
  * @returns {PreparedField}
  */
-function prepareField(model, which) {
-  const { table, decoder } = model[which], [one, two, three] = decoderLayout(model.config, which);
-  const levels = gridLevels(model.config[which]), features = 2 * levels.length;
+function prepareField(model, name) {
+  const { table, decoder } = model[name], [one, two, three] = decoderLayout(model.config, name);
+  const levels = gridLevels(model.config[name]), features = 2 * levels.length;
   const first = packLayer(decoder, one, 0, features, true);
   const directional = packLayer(decoder, one, features, one.inputs, false);
   const middle = packLayer(decoder, two, 0, two.inputs, true), last = packLayer(decoder, three, 0, three.inputs, true);
@@ -223,10 +223,10 @@ function prepareField(model, which) {
  * @param {import("./grids.js").DecoderLayer} layer
  * @param {number} from the index of the first column (input)
  * @param {number} to the index after the last column
- * @param {boolean} biased whether the layer's biases are copied, too
+ * @param {boolean} hasBiases whether the layer's biases are copied, too
  * @returns {Layer}
  */
-function packLayer(decoder, { inputs, outputs, matrix, bias }, from, to, biased) {
+function packLayer(decoder, { inputs, outputs, matrix, bias }, from, to, hasBiases) {
   const stride = OUTPUTS_PER_GROUP * Math.ceil(outputs / OUTPUTS_PER_GROUP), width = to - from;
   const weights = new Float64Array(stride * width), biases = new Float64Array(stride);
   for (let o = 0; o < outputs; o++) {
@@ -234,7 +234,7 @@ function packLayer(decoder, { inputs, outputs, matrix, bias }, from, to, biased)
     for (let i = 0; i < width; i++) {
       weights[group * width + i * OUTPUTS_PER_GROUP + lane] = decoder[matrix + o * inputs + from + i];
     }
-    if (biased) biases[o] = decoder[bias + o];
+    if (hasBiases) biases[o] = decoder[bias + o];
   }
   const index = new Int32Array(width), value = new Float64Array(width);
   return { inputs: width, width: outputs, stride, weights, biases, index, value };
@@ -271,13 +271,13 @@ function contractPositions(model, positions, first, rows, places, radii) {
  * @param {number} rows
  */
 function encodePositions({ levels, table, places, features }, rows) {
-  const wide = 2 * levels.length;
+  const featuresPerRow = 2 * levels.length;
   for (let level = 0; level < levels.length; level++) {
     const { resolution, rows: tableRows, first, dense } = levels[level];
-    const span = resolution - 1, most = resolution - 2, mask = tableRows - 1, start = 2 * first;
-    for (let row = 0, from = 0, to = 2 * level; row < rows; row++, from += 3, to += wide) {
+    const span = resolution - 1, maxCell = resolution - 2, mask = tableRows - 1, start = 2 * first;
+    for (let row = 0, from = 0, to = 2 * level; row < rows; row++, from += 3, to += featuresPerRow) {
       const vx = places[from] * span, vy = places[from + 1] * span, vz = places[from + 2] * span;
-      const x = Math.min(vx | 0, most), y = Math.min(vy | 0, most), z = Math.min(vz | 0, most); // NaN | 0 is 0
+      const x = Math.min(vx | 0, maxCell), y = Math.min(vy | 0, maxCell), z = Math.min(vz | 0, maxCell); // NaN | 0 is 0
       let y0, y1, z0, z1, a, b, c, d, e, f, g, h; // a to h: the rows of the 8 corners; x varies fastest
       if (dense) {
         y0 = resolution * (y + resolution * z) + x;
@@ -375,18 +375,18 @@ function runLaterLayers(field, rows, outputs) {
  * its outputs to zero.
  * @param {Layer} layer
  * @param {Float64Array} from the inputs
- * @param {number} apart the distance in `from` between the starts of two rows
- * @param {boolean} rectified whether a ReLU is applied to the inputs
+ * @param {number} inputStride the distance in `from` between the starts of two rows
+ * @param {boolean} isRectified whether a ReLU is applied to the inputs
  * @param {number} rows
  * @param {Float64Array} to receives the outputs, `stride` numbers for each row
  */
-function runLayer({ inputs, stride, weights, biases, index, value }, from, apart, rectified, rows, to) {
+function runLayer({ inputs, stride, weights, biases, index, value }, from, inputStride, isRectified, rows, to) {
   const groupSize = inputs * OUTPUTS_PER_GROUP;
   for (let row = 0; row < rows; row++) {
     let used = 0;
-    for (let i = 0, at = row * apart; i < inputs; i++, at++) {
+    for (let i = 0, at = row * inputStride; i < inputs; i++, at++) {
       const number = from[at];
-      if (rectified ? number <= 0 : number === 0) continue; // false for NaN, which is kept
+      if (isRectified ? number <= 0 : number === 0) continue; // false for NaN, which is kept
       index[used] = i * OUTPUTS_PER_GROUP;
       value[used++] = number;
     }

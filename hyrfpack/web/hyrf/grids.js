@@ -58,16 +58,16 @@ export const tableRows = (grid) => gridLevels(grid).reduce((sum, { rows }) => su
 /**
  * Returns the three layers of a field's decoder.
  * @param {DecoderConfig} config
- * @param {FieldName} which
+ * @param {FieldName} field
  * @returns {DecoderLayer[]}
  */
-export const decoderLayout = (config, which) => {
-  const directions = which === "radiance" ? FEATURES_PER_DIRECTION[config.direction_encoding] : 0;
-  const widths = [config[which].levels * FEATURES_PER_ROW + directions, config.hidden, config.hidden];
-  let place = 0;
-  return [config.hidden, config.hidden, which === "radiance" ? 3 : 8].map((outputs, layer) => {
-    const inputs = widths[layer], matrix = place, bias = matrix + inputs * outputs;
-    place = bias + outputs;
+export const decoderLayout = (config, field) => {
+  const directions = field === "radiance" ? FEATURES_PER_DIRECTION[config.direction_encoding] : 0;
+  const widths = [config[field].levels * FEATURES_PER_ROW + directions, config.hidden, config.hidden];
+  let offset = 0;
+  return [config.hidden, config.hidden, field === "radiance" ? 3 : 8].map((outputs, layer) => {
+    const inputs = widths[layer], matrix = offset, bias = matrix + inputs * outputs;
+    offset = bias + outputs;
     return { inputs, outputs, matrix, bias };
   });
 };
@@ -75,9 +75,9 @@ export const decoderLayout = (config, which) => {
 /**
  * Returns the number of weights and biases of a field's decoder.
  * @param {DecoderConfig} config
- * @param {FieldName} which
+ * @param {FieldName} field
  */
-export const decoderSize = (config, which) => {
-  const { bias, outputs } = decoderLayout(config, which)[2];
+export const decoderSize = (config, field) => {
+  const { bias, outputs } = decoderLayout(config, field)[2];
   return bias + outputs;
 };

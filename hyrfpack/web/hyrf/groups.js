@@ -27,11 +27,11 @@ const MAX_COUNTED_POINTS = 65536; // in larger layers only every n-th point is c
  * Returns the groups of a decoder's numbers. Each layer has a group for the weights of each output, and then a group
  * for all biases.
  * @param {DecoderConfig} config
- * @param {FieldName} which
+ * @param {FieldName} field
  * @returns {NumberGroups}
  */
-export const decoderGroups = (config, which) => {
-  const layers = decoderLayout(config, which);
+export const decoderGroups = (config, field) => {
+  const layers = decoderLayout(config, field);
   const index = new Uint16Array(layers[2].bias + layers[2].outputs);
   let count = 0;
   for (const { inputs, outputs, matrix, bias } of layers) {
@@ -120,15 +120,15 @@ export const decodeGroups = (data, { index, count, width }) => {
   assertValid(symbolsAt <= data.length, "the lengths of its parts do not fit its bytes");
   const codes = decodeIntegers(data.subarray(8, modelsAt), count, null, false);
   assertValid(codes.every((code) => code <= 255), "a step size is out of range");
-  const used = codes.reduce((sum, code) => sum + (code ? 1 : 0), 0);
-  const chosen = decodeIntegers(data.subarray(modelsAt, symbolsAt), used, null, false);
-  assertValid(chosen.every((model) => model < GROUP_MODEL_COUNT), "a model is out of range");
+  const storedGroups = codes.reduce((sum, code) => sum + (code ? 1 : 0), 0);
+  const storedModels = decodeIntegers(data.subarray(modelsAt, symbolsAt), storedGroups, null, false);
+  assertValid(storedModels.every((model) => model < GROUP_MODEL_COUNT), "a model is out of range");
   let place = 0;
-  const models = codes.map((code) => (code ? chosen[place++] : 0));
+  const models = codes.map((code) => (code ? storedModels[place++] : 0));
 
-  let stored = 0;
-  for (let row = 0; row < index.length; row++) if (codes[index[row]]) stored++;
-  const contexts = new Uint8Array(stored * width);
+  let storedRows = 0;
+  for (let row = 0; row < index.length; row++) if (codes[index[row]]) storedRows++;
+  const contexts = new Uint8Array(storedRows * width);
   place = 0;
   for (let row = 0; row < index.length; row++) {
     if (!codes[index[row]]) continue;

@@ -25,9 +25,10 @@ export const decodeHuffman = (data, count) => {
   const view = new DataView(data.buffer, data.byteOffset, data.length);
   const packedBytes = readUint64(view, 8), leaves = view.getUint32(16, true), endMark = view.getUint32(20, true);
   const symbolBytes = data[24], sizeBytes = data[25];
-  const areWidthsKnown = (symbolBytes === 1 || symbolBytes === 2) && (sizeBytes === 2 || sizeBytes === 4);
-  const isKnown = areWidthsKnown && leaves <= 256 ** symbolBytes + 1;
-  assertValid(isKnown && endMark <= Math.max(leaves - 1, 0), "the header of a Huffman stream has invalid values");
+  const areWidthsValid = (symbolBytes === 1 || symbolBytes === 2) && (sizeBytes === 2 || sizeBytes === 4);
+  const areCountsValid = areWidthsValid && leaves <= 256 ** symbolBytes + 1;
+  const isEndMarkValid = endMark <= Math.max(leaves - 1, 0);
+  assertValid(areCountsValid && isEndMarkValid, "the header of a Huffman stream has invalid values");
   assertValid(readUint64(view, 0) === count, `a Huffman stream has another number of symbols than ${count}`);
   const isPossible = count <= 8 * packedBytes && count > 0 === packedBytes > 0 && (leaves > 0 || count === 0);
   assertValid(isPossible, "a Huffman stream has too many symbols");
@@ -60,8 +61,8 @@ export const decodeHuffman = (data, count) => {
 const buildHuffmanCode = (symbols, lengths) => {
   const leaves = symbols.length;
   assertValid(new Set(symbols).size === leaves, "a symbol has two Huffman codes");
-  const areKnown = lengths.every((length) => length >= 1 && length <= MAX_HUFFMAN_CODE_BITS);
-  assertValid(areKnown, "a Huffman code has too few or too many bits");
+  const areInRange = lengths.every((length) => length >= 1 && length <= MAX_HUFFMAN_CODE_BITS);
+  assertValid(areInRange, "a Huffman code has too few or too many bits");
   const high = new Uint32Array(leaves), low = new Uint32Array(leaves);
   let sumHigh = 0, sumLow = 0;
   for (let leaf = 0; leaf < leaves; leaf++) {

@@ -2,6 +2,7 @@
 
 import { DamagedData, assertValid } from "./errors.js";
 
+const BLOCK_STORED = 0;
 const BLOCK_FIXED = 1;
 const BLOCK_DYNAMIC = 2;
 const MAX_DEFLATE_CODE_BITS = 15;
@@ -32,14 +33,14 @@ const buildDeflateCode = (lengths, mayBeSingle) => {
   for (let i = 0; i < lengths.length; i++) counts[lengths[i]]++;
   const used = lengths.length - counts[0];
   counts[0] = 0;
-  let left = 1;
+  let unassigned = 1; // codes of the present length that no shorter code begins
   for (let length = 1; length <= MAX_DEFLATE_CODE_BITS; length++) {
-    left = 2 * left - counts[length];
-    assertValid(left >= 0, "a deflate code has too many symbols");
+    unassigned = 2 * unassigned - counts[length];
+    assertValid(unassigned >= 0, "a deflate code has too many symbols");
     starts[length + 1] = starts[length] + counts[length];
   }
   const isSingle = used === 0 || (used === 1 && counts[1] === 1);
-  assertValid(left === 0 || (mayBeSingle && isSingle), "a deflate code has gaps");
+  assertValid(unassigned === 0 || (mayBeSingle && isSingle), "a deflate code has gaps");
   const symbols = new Uint16Array(used);
   for (let i = 0; i < lengths.length; i++) if (lengths[i]) symbols[starts[lengths[i]]++] = i;
   return { counts, symbols };
@@ -78,7 +79,10 @@ export const inflateZlib = (data, length) => {
   assertValid(data.length > 2 && (data[0] & 15) === 8 && data[0] >> 4 <= 7, "it is not a zlib stream");
   assertValid((data[0] * 256 + data[1]) % 31 === 0 && !(data[1] & 32), "it is not a zlib stream");
 
-  /** @param {number} count at most 16 */
+  /**
+   * Reads the next bits, the lowest first.
+   * @param {number} count at most 16
+   */
   const takeBits = (count) => {
     while (bits < count) {
       assertValid(offset < data.length, "a deflate stream is cut short");
@@ -91,7 +95,10 @@ export const inflateZlib = (data, length) => {
     return value;
   };
 
-  /** @param {DeflateCode} code */
+  /**
+   * Reads the next symbol.
+   * @param {DeflateCode} code
+   */
   const takeSymbol = ({ counts, symbols }) => {
     for (let length = 1, code = 0, first = 0, index = 0; length <= MAX_DEFLATE_CODE_BITS; length++) {
       code |= takeBits(1);
@@ -110,6 +117,7 @@ export const inflateZlib = (data, length) => {
     out[written++] = byte;
   };
 
+  /** Copies a block that is not compressed. */
   const copyStored = () => {
     pending = bits = 0; // a stored block begins at the next whole byte
     const count = takeBits(16), inverse = takeBits(16);
@@ -120,6 +128,10 @@ export const inflateZlib = (data, length) => {
     written += count;
   };
 
+  /**
+   * Reads the codes of literals and of distances of a block with codes of its own.
+   * @returns {DeflateCode[]}
+   */
   const readDynamicCodes = () => {
     const literals = 257 + takeBits(5), distances = 1 + takeBits(5), ordered = 4 + takeBits(4);
     assertValid(literals <= 286 && distances <= 30, "a deflate block has too many symbols");
@@ -144,7 +156,10 @@ export const inflateZlib = (data, length) => {
     return [buildDeflateCode(lengths.subarray(0, literals), true), buildDeflateCode(lengths.subarray(literals), true)];
   };
 
-  /** @param {DeflateCode[]} codes */
+  /**
+   * Decompresses a block.
+   * @param {DeflateCode[]} codes those of literals and of distances
+   */
   const inflateBlock = ([literalCode, distanceCode]) => {
     for (;;) {
       const symbol = takeSymbol(literalCode);
@@ -164,11 +179,11 @@ export const inflateZlib = (data, length) => {
     }
   };
 
-  for (let last = false; !last; ) {
-    last = takeBits(1) === 1;
+  for (let isLast = false; !isLast; ) {
+    isLast = takeBits(1) === 1;
     const kind = takeBits(2);
     assertValid(kind <= BLOCK_DYNAMIC, "a deflate block has an unknown kind");
-    if (kind === 0) copyStored();
+    if (kind === BLOCK_STORED) copyStored();
     else inflateBlock(kind === BLOCK_FIXED ? FIXED_CODES : readDynamicCodes());
   }
   assertValid(written === length && offset + 4 === data.length, `it does not unpack to ${length} bytes`);

@@ -77,19 +77,19 @@ export const decodeWideIntegers = (data, count) => {
   const { tokens, end } = decodeTokens(data, count, null);
   const reader = new BitReader(data.subarray(end), sumExtraBits(tokens));
   const high = new Int32Array(count), low = new Int32Array(count);
-  const half = LOW_HALF_BITS - MAX_BITS_PER_READ;
+  const restBitsOfLow = LOW_HALF_BITS - MAX_BITS_PER_READ;
   for (let i = 0; i < count; i++) {
     const bits = TOKEN_EXTRA_BITS[tokens[i]], leading = TOKEN_LEADING_BITS[tokens[i]];
     if (bits < MAX_BITS_PER_READ) {
       low[i] = (leading << bits) | reader.take(bits);
       continue;
     }
-    const lowest = reader.take(MAX_BITS_PER_READ), left = bits - MAX_BITS_PER_READ;
-    let rest = leading << left; // all bits but the lowest 24: at most 32 bits
-    rest |= reader.take(Math.min(left, MAX_BITS_PER_READ));
-    if (left > MAX_BITS_PER_READ) rest |= reader.take(left - MAX_BITS_PER_READ) << MAX_BITS_PER_READ;
-    low[i] = ((rest & ((1 << half) - 1)) << MAX_BITS_PER_READ) | lowest;
-    high[i] = rest >>> half;
+    const lowest = reader.take(MAX_BITS_PER_READ), restBits = bits - MAX_BITS_PER_READ;
+    let rest = leading << restBits; // all bits but the lowest 24: at most 32 bits
+    rest |= reader.take(Math.min(restBits, MAX_BITS_PER_READ));
+    if (restBits > MAX_BITS_PER_READ) rest |= reader.take(restBits - MAX_BITS_PER_READ) << MAX_BITS_PER_READ;
+    low[i] = ((rest & ((1 << restBitsOfLow) - 1)) << MAX_BITS_PER_READ) | lowest;
+    high[i] = rest >>> restBitsOfLow;
   }
   return { high, low };
 };

@@ -34,9 +34,9 @@ export class JsonNumber {
  * @throws {DamagedData} the text is not JSON, is nested too deeply, or has a number that is too large
  */
 export const parseJson = (text) => {
-  let place = 0;
+  let position = 0;
 
-  const invalidJson = () => new DamagedData(`it is not valid JSON at character ${place}`);
+  const invalidJson = () => new DamagedData(`it is not valid JSON at character ${position}`);
 
   /** @param {boolean} holds */
   const assertJson = (holds) => {
@@ -44,34 +44,34 @@ export const parseJson = (text) => {
   };
 
   const skipWhitespace = () => {
-    for (; ; place++) {
-      const code = text.charCodeAt(place);
+    for (; ; position++) {
+      const code = text.charCodeAt(position);
       if (code !== 32 && code !== 10 && code !== 13 && code !== 9) return;
     }
   };
 
   /**
-   * Consumes the next character that is not white space if it is `sign`. Returns whether it was.
-   * @param {string} sign
+   * Skips white space, and then the next character if it is `character`. Returns whether it was.
+   * @param {string} character
    */
-  const accept = (sign) => {
+  const accept = (character) => {
     skipWhitespace();
-    const isNext = text[place] === sign;
-    if (isNext) place++;
+    const isNext = text[position] === character;
+    if (isNext) position++;
     return isNext;
   };
 
   /** @returns {string} */
   const parseString = () => {
-    const start = place;
+    const start = position;
     assertJson(accept('"'));
-    while (text[place] !== '"') {
-      assertJson(place < text.length);
-      place += text[place] === "\\" ? 2 : 1;
+    while (text[position] !== '"') {
+      assertJson(position < text.length);
+      position += text[position] === "\\" ? 2 : 1;
     }
-    place++;
+    position++;
     try {
-      return JSON.parse(text.slice(start, place));
+      return JSON.parse(text.slice(start, position));
     } catch {
       throw invalidJson();
     }
@@ -79,10 +79,10 @@ export const parseJson = (text) => {
 
   /** @returns {JsonNumber} */
   const parseNumber = () => {
-    NUMBER_PATTERN.lastIndex = place;
+    NUMBER_PATTERN.lastIndex = position;
     const match = NUMBER_PATTERN.exec(text);
     if (!match) throw invalidJson();
-    place = NUMBER_PATTERN.lastIndex;
+    position = NUMBER_PATTERN.lastIndex;
     const isInteger = match[1] === undefined && match[2] === undefined;
     const number = new JsonNumber(match[0], isInteger);
     if (!isInteger) assertValid(Number.isFinite(number.value), "a number is not finite");
@@ -122,16 +122,16 @@ export const parseJson = (text) => {
    */
   const parseValue = (depth) => {
     skipWhitespace();
-    const sign = text[place];
-    if (sign === "{" || sign === "[") {
+    const first = text[position];
+    if (first === "{" || first === "[") {
       assertValid(depth < MAX_NESTING_DEPTH, `it is nested deeper than ${MAX_NESTING_DEPTH} levels`);
-      place++;
-      return sign === "{" ? parseObject(depth + 1) : parseList(depth + 1);
+      position++;
+      return first === "{" ? parseObject(depth + 1) : parseList(depth + 1);
     }
-    if (sign === '"') return parseString();
+    if (first === '"') return parseString();
     for (const [word, value] of JSON_LITERALS) {
-      if (sign === word[0] && text.startsWith(word, place)) {
-        place += word.length;
+      if (first === word[0] && text.startsWith(word, position)) {
+        position += word.length;
         return value;
       }
     }
@@ -140,6 +140,6 @@ export const parseJson = (text) => {
 
   const value = parseValue(0);
   skipWhitespace();
-  assertJson(place === text.length);
+  assertJson(position === text.length);
   return value;
 };

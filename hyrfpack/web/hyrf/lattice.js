@@ -19,6 +19,9 @@ const TAIL_BITS_PER_READ = 24; // must be a multiple of 3 and at most MAX_BITS_P
 /** Centres of cells are given in units of 2^-CENTER_BITS_PER_AXIS of the cube's edge. */
 export const CENTER_BITS_PER_AXIS = MAX_BITS_PER_AXIS + 1;
 
+const CUBE_CENTER = 2 ** MAX_BITS_PER_AXIS; // in the units of centres
+const MAX_CONTRACTED_RADIUS = 2 - 2 ** -20; // farther points would be at infinity; the ball of radius 1 is the frame
+
 /**
  * Extracts every third bit of a Morton code of 27 bits, beginning with the lowest bit.
  * @param {number} code
@@ -44,8 +47,8 @@ export const decodeLattice = (data, count) => {
   const view = new DataView(data.buffer, data.byteOffset, data.length);
   const base = data[0], classCount = data[1], gapsAt = LATTICE_HEADER_BYTES + classCount;
   const classesAt = gapsAt + view.getUint32(2, true), tailsAt = classesAt + view.getUint32(6, true);
-  const areClassesKnown = classCount >= 1 && classCount <= MAX_POINT_CLASSES;
-  assertValid(base >= 1 && base <= MAX_BITS_PER_AXIS && areClassesKnown, "its header has invalid values");
+  const areClassesValid = classCount >= 1 && classCount <= MAX_POINT_CLASSES;
+  assertValid(base >= 1 && base <= MAX_BITS_PER_AXIS && areClassesValid, "its header has invalid values");
   assertValid(tailsAt <= data.length, "it ends too early");
   const bits = data.subarray(LATTICE_HEADER_BYTES, gapsAt);
   assertValid(bits.every((b) => b >= base && b <= MAX_BITS_PER_AXIS), "a class of points has too few or too many bits");
@@ -97,12 +100,12 @@ export const decodeLattice = (data, count) => {
  * @returns {Float32Array} (3 N), local units
  */
 export const latticePositions = ({ centers, count }, [width, height, depth]) => {
-  const positions = new Float32Array(3 * count), outermost = 2 - 2 ** -20;
+  const positions = new Float32Array(3 * count), unitRadius = CUBE_CENTER / 2;
   for (let i = 0; i < 3 * count; i += 3) {
-    const x = (centers[i] - 262144) / 131072, y = (centers[i + 1] - 262144) / 131072;
-    const z = (centers[i + 2] - 262144) / 131072;
+    const x = (centers[i] - CUBE_CENTER) / unitRadius, y = (centers[i + 1] - CUBE_CENTER) / unitRadius;
+    const z = (centers[i + 2] - CUBE_CENTER) / unitRadius;
     const radius = Math.max(Math.sqrt(x * x + y * y + z * z), 1);
-    const divisor = radius * (2 - Math.min(radius, outermost));
+    const divisor = radius * (2 - Math.min(radius, MAX_CONTRACTED_RADIUS));
     positions[i] = (x / divisor) * width;
     positions[i + 1] = (y / divisor) * height;
     positions[i + 2] = (z / divisor) * depth;

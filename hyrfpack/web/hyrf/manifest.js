@@ -1,7 +1,7 @@
 // The manifest of a scene folder, `scene.json` (docs/reference/scene-folder.md). It is not trusted: all that is used of
 // it is checked.
 
-import { MAX_PARTS } from "./container.js";
+import { MAX_FILE_BYTES, MAX_PARTS } from "./container.js";
 import { DamagedData, HyrfFormatError, assertValid, groupedDigits, quotedText, requireBytes } from "./errors.js";
 import { MAX_NESTING_DEPTH } from "./json.js";
 import { MAX_QUAT_LENGTH_ERROR } from "./metadata.js";
@@ -41,7 +41,6 @@ const MAX_ERROR_RADII = 16;
 const MAX_CAMERAS = 1024, MAX_CAMERA_NUMBERS = 32;
 const MAX_TEXT_LENGTH = 1000;
 const INTEGER_LIMIT = 2 ** 40;
-const MAX_FILE_BYTES = 2 ** 34;
 
 /**
  * Parses a manifest.
@@ -59,9 +58,9 @@ export const parseManifest = (bytes) => {
       throw new HyrfFormatError("This is not the manifest of a scene folder; check the address.");
     }
     assertValid(!isTooDeep(values, MAX_NESTING_DEPTH), `it is nested deeper than ${MAX_NESTING_DEPTH} levels`);
-    const isOne = readMajorVersion(values.version) < PARTS_VERSION;
-    const manifest = isOne ? { ...values, ...onePart(values) } : values;
-    checkManifest(manifest, isOne ? 1 : 2);
+    const hasOnePart = readMajorVersion(values.version) < PARTS_VERSION;
+    const manifest = hasOnePart ? { ...values, ...wrapOnePart(values) } : values;
+    checkManifest(manifest, hasOnePart ? 1 : 2);
     return manifest;
   } catch (error) {
     if (!(error instanceof DamagedData)) throw error;
@@ -70,6 +69,7 @@ export const parseManifest = (bytes) => {
 };
 
 /**
+ * Parses JSON in UTF-8.
  * @param {Uint8Array} bytes
  * @returns {any}
  */
@@ -91,7 +91,11 @@ const parseText = (bytes) => {
 const isTooDeep = (value, levels) =>
   Object(value) === value && (levels === 0 || Object.values(value).some((inner) => isTooDeep(inner, levels - 1)));
 
-/** @param {any} version */
+/**
+ * Returns the major version of a manifest.
+ * @param {any} version
+ * @throws {HyrfFormatError} this reader does not know the version
+ */
 const readMajorVersion = (version) => {
   const match = typeof version === "string" ? /^(\d{1,4})\.\d{1,4}$/.exec(version) : null;
   if (!match) throw new DamagedData("it has no version");
@@ -101,10 +105,10 @@ const readMajorVersion = (version) => {
 };
 
 /**
- * Returns the parts and the chunks of a scene of version 1.
+ * Returns the parts and the chunks of a scene of version 1 as those of a scene of version 2 with one part.
  * @param {Record<string, any>} values
  */
-const onePart = ({ shared, chunks }) => {
+const wrapOnePart = ({ shared, chunks }) => {
   checkFile(shared, "shared");
   checkList(chunks, "chunks", 0, MAX_CHUNKS);
   const owned = chunks.map((/** @type {any} */ chunk) => (isObject(chunk) ? { ...chunk, part: 0 } : chunk));
@@ -112,15 +116,16 @@ const onePart = ({ shared, chunks }) => {
 };
 
 /**
+ * Checks all values that this package uses, and that they fit each other.
  * @param {Record<string, any>} values
- * @param {number} leastParts
+ * @param {number} minParts
  */
-const checkManifest = (values, leastParts) => {
+const checkManifest = (values, minParts) => {
   const { chunks, parts, error_radii: radii } = values;
   checkNumbers(radii, "error_radii", 1, MAX_ERROR_RADII, 0);
-  const rises = radii.every((/** @type {number} */ radius, /** @type {number} */ k) => radius > (k ? radii[k - 1] : 0));
-  assertValid(rises, "'error_radii' do not rise");
-  checkList(parts, "parts", leastParts, MAX_PARTS);
+  const isRising = (/** @type {number} */ radius, /** @type {number} */ k) => radius > (k ? radii[k - 1] : 0);
+  assertValid(radii.every(isRising), "'error_radii' do not rise");
+  checkList(parts, "parts", minParts, MAX_PARTS);
   for (const part of parts) checkFile(part, "parts");
   assertValid(arePartNames(parts.map((/** @type {any} */ { name }) => name)), "the names of its parts are not valid");
   checkList(chunks, "chunks", 0, MAX_CHUNKS);
@@ -146,7 +151,7 @@ const checkManifest = (values, leastParts) => {
 };
 
 /**
- * Checks what places a view; the files have the whole frame.
+ * Checks the part of the scene's frame by which a view is placed. The files have the whole frame.
  * @param {any} frame
  */
 const checkFrame = ({ center, scale, rotation = IDENTITY_QUAT }) => {
@@ -171,28 +176,30 @@ export const listFiles = ({ parts, chunks }) => [...parts, ...chunks.flatMap(({ 
 export const sharedBytes = ({ parts }) => parts.reduce((sum, { bytes }) => sum + bytes, 0);
 
 /**
+ * Checks a chunk and its levels.
  * @param {any} chunk
- * @param {number} radii the number of errors of a level
- * @param {number} parts their number
+ * @param {number} radiusCount the number of errors of a level
+ * @param {number} partCount
  */
-const checkChunk = (chunk, radii, parts) => {
+const checkChunk = (chunk, radiusCount, partCount) => {
   assertValid(isObject(chunk), "a chunk is no object");
   for (const key of ["low", "high"]) checkNumbers(chunk[key], key, 3, 3);
   const inOrder = chunk.low.every((/** @type {number} */ low, /** @type {number} */ axis) => low <= chunk.high[axis]);
   assertValid(inOrder, "the box of a chunk is not in order");
   checkInteger(chunk.part, "part");
-  assertValid(chunk.part < parts, `a chunk belongs to part ${chunk.part}, and there are ${parts} parts`);
+  assertValid(chunk.part < partCount, `a chunk belongs to part ${chunk.part}, and there are ${partCount} parts`);
   checkList(chunk.levels, "levels", 1, MAX_LEVELS);
   for (const level of chunk.levels) {
     checkFile(level, "levels");
     checkInteger(level.gaussians, "gaussians");
-    checkNumbers(level.errors, "errors", radii, radii, 0);
+    checkNumbers(level.errors, "errors", radiusCount, radiusCount, 0);
   }
 };
 
 /**
+ * Checks the entry of a file.
  * @param {any} file
- * @param {string} key
+ * @param {string} key where the entry is, for the error message
  */
 const checkFile = (file, key) => {
   assertValid(isObject(file), `'${key}' must be an object`);
@@ -206,10 +213,14 @@ const checkFile = (file, key) => {
   assertValid(isChecksum, `the checksum of ${file.file} is not 8 hexadecimal digits`);
 };
 
-/** @param {any} value */
+/**
+ * Returns whether a value is an object, and no list.
+ * @param {any} value
+ */
 const isObject = (value) => typeof value === "object" && value !== null && !Array.isArray(value);
 
 /**
+ * Checks that a value is an integer from 0 to INTEGER_LIMIT - 1.
  * @param {any} value
  * @param {string} key
  */
@@ -217,25 +228,27 @@ const checkInteger = (value, key) =>
   assertValid(Number.isInteger(value) && value >= 0 && value < INTEGER_LIMIT, `'${key}' is out of range`);
 
 /**
+ * Checks that a value is a list of `minLength` to `maxLength` entries.
  * @param {any} list
  * @param {string} key
- * @param {number} least
- * @param {number} most
+ * @param {number} minLength
+ * @param {number} maxLength
  */
-const checkList = (list, key, least, most) => {
-  if (Array.isArray(list) && list.length >= least && list.length <= most) return;
-  throw new DamagedData(`'${key}' must be a list of ${least} to ${groupedDigits(most)} entries`);
+const checkList = (list, key, minLength, maxLength) => {
+  if (Array.isArray(list) && list.length >= minLength && list.length <= maxLength) return;
+  throw new DamagedData(`'${key}' must be a list of ${minLength} to ${groupedDigits(maxLength)} entries`);
 };
 
 /**
+ * Checks that a value is a list of `minLength` to `maxLength` finite numbers.
  * @param {any} numbers
  * @param {string} key
- * @param {number} least the smallest length of the list
- * @param {number} most its largest length
+ * @param {number} minLength
+ * @param {number} maxLength
  * @param {number} [minimum] of the numbers
  */
-const checkNumbers = (numbers, key, least, most, minimum = -Infinity) => {
-  checkList(numbers, key, least, most);
+const checkNumbers = (numbers, key, minLength, maxLength, minimum = -Infinity) => {
+  checkList(numbers, key, minLength, maxLength);
   const areFinite = numbers.every((/** @type {any} */ value) => Number.isFinite(value) && value >= minimum);
   assertValid(areFinite, `'${key}' holds something else than numbers in range`);
 };

@@ -18,8 +18,9 @@ import { FLOATS_PER_SHAPE, GAUSSIANS_PER_ROW, ViewEvaluator } from "./view_evalu
  * @typedef {{evaluator: ViewEvaluator, place: Place, firstRow: number, rowCount: number}} Part
  */
 
+/** The models of a file, drawn as one set of Gaussians. */
 export class MergedEvaluator {
-  /** @param {import("./reader.js").Model[]} models */
+  /** @param {import("./reader.js").Model[]} models the scene first */
   constructor(models) {
     /** The number of rows. */
     this.rowCount = 0;
@@ -30,7 +31,7 @@ export class MergedEvaluator {
       this.rowCount += rowCount;
       return { evaluator, place: placeOf(model.config.frame, models[0].config.frame), firstRow, rowCount };
     });
-    const joined = new Float32Array(3 * GAUSSIANS_PER_ROW * this.rowCount).fill(NaN); // which is not drawn
+    const joined = new Float32Array(3 * GAUSSIANS_PER_ROW * this.rowCount).fill(NaN); // splats at NaN are not drawn
     for (const { evaluator: { model }, place, firstRow } of this.parts) {
       joined.set(movePositions(model.positions, place), 3 * GAUSSIANS_PER_ROW * firstRow);
     }
@@ -51,7 +52,7 @@ export class MergedEvaluator {
   }
 
   /**
-   * See ViewEvaluator. What is in view of all models comes first.
+   * Evaluates what a view needs, like `ViewEvaluator.evaluate`. What is in view of all models comes first.
    * @param {View} view
    * @param {() => void} onComplete
    * @returns {Generator<EvaluatedRow | SkyTile, void>}
@@ -64,13 +65,13 @@ export class MergedEvaluator {
       while (!isComplete) {
         const { value, done } = steps.next();
         if (done || !value) break;
-        yield moved(value, part);
+        yield moveToScene(value, part);
       }
       rest.push({ part, steps });
     }
     onComplete();
     for (const { part, steps } of rest) {
-      for (const value of steps) yield moved(value, part);
+      for (const value of steps) yield moveToScene(value, part);
     }
   }
 }
@@ -81,7 +82,7 @@ export class MergedEvaluator {
  * @param {Part} part
  * @returns {EvaluatedRow | SkyTile}
  */
-function moved(value, { place, firstRow }) {
+function moveToScene(value, { place, firstRow }) {
   if (!("row" in value) || place === IDENTITY_PLACE) return value;
   const { shapes, pixelSizes } = value;
   for (let at = 0; shapes && at < shapes.length; at += FLOATS_PER_SHAPE) {

@@ -99,7 +99,7 @@ const checkMetadata = (node) => {
   const layers = requireList(values.has("layers") ? values.get("layers") : [], "layers");
   assertValid(layers.length <= MAX_LAYERS, `there are ${layers.length} layers`);
   const counts = layers.map((count) => requireInteger(count, "layers", 0, MAX_GAUSSIANS));
-  const sum = counts.reduce((before, count) => before + count, 0);
+  const sum = counts.reduce((total, count) => total + count, 0);
   assertValid(counts.length === 0 || sum === gaussians, `its layers do not add up to ${gaussians} Gaussians`);
   checkRules(values.get("rules"));
   checkConfig(values.get("config"));

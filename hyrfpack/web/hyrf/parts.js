@@ -44,12 +44,15 @@ export const arePartNames = (names) =>
   Array.isArray(names) && names.length >= 1 && names.length <= MAX_PARTS && names.every(isName) &&
   new Set(names).size === names.length;
 
-/** @param {any} name */
+/**
+ * Returns whether a value may name a part.
+ * @param {any} name
+ */
 const isName = (name) =>
   typeof name === "string" && name.length > 0 && [...name].length <= MAX_NAME_LENGTH && !CONTROL_CHARACTERS.test(name);
 
 /**
- * Returns name and container of each part, after a check of all sizes that they declare.
+ * Returns the name and the container of each part, after it has checked all sizes that the parts declare.
  * @param {Container} container of a merged file that is complete
  * @returns {{name: string, container: Container}[]}
  * @throws {HyrfFormatError} a part is missing or damaged, is itself a merged file, or refers to another file; or the

@@ -4,7 +4,9 @@ import { frameAxes, rotateBack, rotateBy } from "./rotation.js";
 import { add, mul, sub } from "./vectors.js";
 
 /**
+ * Where a part lies: `rows` are those of the rotation from the part's local axes to those of the scene.
  * @typedef {{rows: number[][], scale: number, shift: number[]}} Place
+ *
  * @typedef {import("./frustum.js").View & {eye?: number[]}} View
  */
 

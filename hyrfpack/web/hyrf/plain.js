@@ -60,11 +60,11 @@ export const decodeFloat16 = (data, count) => {
  */
 export const decodeVectors = (data, rows, columns) => {
   assertValid(data.length >= VECTORS_HEADER_BYTES, "it ends within its header");
-  const stages = data[0], words = data[2] | (data[3] << 8);
-  const codebooksEnd = VECTORS_HEADER_BYTES + 2 * stages * words * columns;
-  const isKnown = stages >= 1 && stages <= MAX_STAGES && data[1] === columns && words >= 1;
-  assertValid(isKnown && codebooksEnd <= data.length, "the sizes of its codebooks are invalid");
-  const codebooks = decodeFloat16(data.subarray(VECTORS_HEADER_BYTES, codebooksEnd), stages * words * columns);
+  const stages = data[0], codewords = data[2] | (data[3] << 8);
+  const codebooksEnd = VECTORS_HEADER_BYTES + 2 * stages * codewords * columns;
+  const areSizesValid = stages >= 1 && stages <= MAX_STAGES && data[1] === columns && codewords >= 1;
+  assertValid(areSizesValid && codebooksEnd <= data.length, "the sizes of its codebooks are invalid");
+  const codebooks = decodeFloat16(data.subarray(VECTORS_HEADER_BYTES, codebooksEnd), stages * codewords * columns);
   assertValid(codebooks.every(Number.isFinite), "its codebooks hold numbers that are not finite");
   const view = new DataView(data.buffer, data.byteOffset, data.length);
   const numbers = new Float32Array(rows * columns);
@@ -75,9 +75,9 @@ export const decodeVectors = (data, rows, columns) => {
     place = start + readUint64(view, place);
     assertValid(place <= data.length, "it ends before its last stage");
     const indices = decodeHuffman(data.subarray(start, place), rows);
-    const codebook = codebooks.subarray(stage * words * columns, (stage + 1) * words * columns);
+    const codebook = codebooks.subarray(stage * codewords * columns, (stage + 1) * codewords * columns);
     for (let row = 0, at = 0; row < rows; row++) {
-      assertValid(indices[row] < words, "it refers to a codeword that is not there");
+      assertValid(indices[row] < codewords, "it refers to a codeword that is not there");
       for (let word = indices[row] * columns, end = word + columns; word < end; ) numbers[at++] += codebook[word++];
     }
   }
@@ -96,11 +96,11 @@ export const decodeMinMax = (data, count) => {
   const minimum = view.getFloat32(0, true), maximum = view.getFloat32(4, true), bits = data[8];
   const isRange = minimum > -Infinity && minimum <= maximum && maximum < Infinity;
   assertValid(isRange && bits >= 1 && bits <= 16, "its range is invalid");
-  const codes = decodeHuffman(data.subarray(MIN_MAX_HEADER_BYTES), count), last = 2 ** bits - 1;
+  const codes = decodeHuffman(data.subarray(MIN_MAX_HEADER_BYTES), count), lastCode = 2 ** bits - 1;
   const numbers = new Float32Array(count);
   for (let i = 0; i < count; i++) {
-    assertValid(codes[i] <= last, "a code has too many bits");
-    numbers[i] = ((last - codes[i]) * minimum + codes[i] * maximum) / last;
+    assertValid(codes[i] <= lastCode, "a code has too many bits");
+    numbers[i] = ((lastCode - codes[i]) * minimum + codes[i] * maximum) / lastCode;
   }
   return numbers;
 };

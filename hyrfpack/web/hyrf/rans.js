@@ -11,6 +11,8 @@ const FREQUENCY_BITS = 12;
 const FREQUENCY_SUM = 1 << FREQUENCY_BITS; // the sum of the token frequencies of a model
 const FINAL_LANE_STATE = 65536; // the state of each lane after its last token
 const MAX_WEIGHT_LEVEL = 49;
+const WEIGHT_PER_TOKEN = 65536; // of an adaptive model, for each time that the token has occurred
+const SHARED_WEIGHT_SUM = 2 ** 20; // about the sum of the weights that all adaptive models share
 const MODEL_STRIDE = 128; // entries of a model in the tables: a power of two above the number of tokens
 const BUCKET_SIZE_LOG2 = 4; // a lookup table gives the first token of each bucket of positions
 const BUCKETS_PER_MODEL = FREQUENCY_SUM >> BUCKET_SIZE_LOG2;
@@ -49,10 +51,10 @@ export const decodeTokens = (data, count, contexts, mayBeStatic = true) => {
   if (alphabet === 0) return decodeConstantTokens(data, count, contexts, contextCount);
   const lanesLog2 = data[0] & 15, classes = ((data[0] >> 4) & 7) + 1, isStatic = data[0] >= 128;
   const models = contextCount * classes;
-  const isKnown = alphabet <= MAX_ALPHABET_TOKENS && models <= MAX_MODELS && lanesLog2 <= MAX_LANES_LOG2;
-  assertValid(isKnown && (mayBeStatic || !isStatic), "a stream's header has invalid values");
-  const areLanesEnough = count <= MAX_STEPS_PER_LANE * 2 ** lanesLog2 || lanesLog2 === MAX_LANES_LOG2;
-  assertValid(areLanesEnough, "a stream has too few lanes");
+  const isInRange = alphabet <= MAX_ALPHABET_TOKENS && models <= MAX_MODELS && lanesLog2 <= MAX_LANES_LOG2;
+  assertValid(isInRange && (mayBeStatic || !isStatic), "a stream's header has invalid values");
+  const hasEnoughLanes = count <= MAX_STEPS_PER_LANE * 2 ** lanesLog2 || lanesLog2 === MAX_LANES_LOG2;
+  assertValid(hasEnoughLanes, "a stream has too few lanes");
   let place = 2 + classes - 1;
   const tokenClasses = classByToken(data.subarray(2, place), alphabet);
   const tables = new ModelTables(models, alphabet);
@@ -68,12 +70,14 @@ export const decodeTokens = (data, count, contexts, mayBeStatic = true) => {
  * @param {number} contextCount
  */
 const decodeConstantTokens = (data, count, contexts, contextCount) => {
-  const end = 2 + contextCount, only = data.subarray(2, end);
-  const isKnown = data[0] === 0 && only.length === contextCount && only.every((token) => token < MAX_ALPHABET_TOKENS);
-  assertValid(isKnown, "the tokens of a stream's contexts are missing or damaged");
+  const end = 2 + contextCount, contextTokens = data.subarray(2, end);
+  const areTokensValid =
+    data[0] === 0 && contextTokens.length === contextCount &&
+    contextTokens.every((token) => token < MAX_ALPHABET_TOKENS);
+  assertValid(areTokensValid, "the tokens of a stream's contexts are missing or damaged");
   const tokens = new Uint8Array(count);
-  if (contexts && contextCount > 1) for (let i = 0; i < count; i++) tokens[i] = only[contexts[i]];
-  else tokens.fill(only[0]);
+  if (contexts && contextCount > 1) for (let i = 0; i < count; i++) tokens[i] = contextTokens[contexts[i]];
+  else tokens.fill(contextTokens[0]);
   return { tokens, end };
 };
 
@@ -84,8 +88,8 @@ const decodeConstantTokens = (data, count, contexts, contextCount) => {
  */
 const classByToken = (thresholds, alphabet) => {
   const edges = [0, ...thresholds, alphabet];
-  const doRise = edges.every((edge, i) => i === 0 || edges[i - 1] < edge);
-  assertValid(doRise, "the thresholds of a stream's classes do not rise");
+  const areRising = edges.every((edge, i) => i === 0 || edges[i - 1] < edge);
+  assertValid(areRising, "the thresholds of a stream's classes do not rise");
   return Uint8Array.from({ length: alphabet }, (_, token) => thresholds.filter((edge) => edge <= token).length);
 };
 
@@ -178,54 +182,62 @@ const readStaticModels = (data, tables) => {
  */
 const decodeLanes = (data, place, count, contexts, classes, tokenClasses, tables, lanes, isStatic) => {
   const { models, alphabet, sums, firsts, weights } = tables;
-  const least = Math.ceil(count / lanes), steps = least % 2 ? least : least + 1;
-  const used = Math.ceil(count / steps), last = count - (used - 1) * steps;
-  let word = place + 4 * used;
+  const minSteps = Math.ceil(count / lanes), steps = minSteps % 2 ? minSteps : minSteps + 1;
+  const usedLanes = Math.ceil(count / steps), lastLaneTokens = count - (usedLanes - 1) * steps;
+  let word = place + 4 * usedLanes;
   assertValid(word <= data.length, "a stream ends within the states of its lanes");
   const wordsEnd = word + Math.floor((data.length - word) / 2) * 2;
   const view = new DataView(data.buffer, data.byteOffset, data.length);
-  const states = Int32Array.from({ length: used }, (_, lane) => view.getInt32(place + 4 * lane, true));
+  const states = Int32Array.from({ length: usedLanes }, (_, lane) => view.getInt32(place + 4 * lane, true));
   const tokens = new Uint8Array(count);
-  const laneClasses = new Uint8Array(used);
+  const laneClasses = new Uint8Array(usedLanes);
 
-  // Adaptive models are updated at certain steps. `seen` counts the tokens of each model so far, `seenBefore` up to the
-  // last update, and `shared` is the part of the weights that all models share. A model is built when it is first used
-  // after an update.
+  // Adaptive models are updated at certain steps. `seen` counts the tokens of each model so far, `seenBefore` those up
+  // to the last update, and `sharedWeights` are the parts of the weights that all models share. A model is built when
+  // it is first used after an update; `builtAt` is the number of updates at that time.
   const seen = new Uint32Array(isStatic ? 0 : models * MODEL_STRIDE), seenBefore = new Uint32Array(seen.length);
-  const shared = new Float64Array(alphabet);
+  const sharedWeights = new Float64Array(alphabet);
   const builtAt = new Int32Array(models).fill(isStatic ? 0 : -1);
-  let change = isStatic ? Infinity : 0, changes = 0;
+  let nextUpdateStep = isStatic ? Infinity : 0, updates = 0;
 
-  const shareCounts = () => {
+  /** Adapts the weights to the tokens so far. */
+  const updateWeights = () => {
     seenBefore.set(seen);
     let sum = 0;
     for (let token = 0; token < alphabet; token++) {
-      let all = 0;
-      for (let model = 0; model < models; model++) all += seen[model * MODEL_STRIDE + token];
-      shared[token] = 1 + 2 * all;
-      sum += shared[token];
+      let total = 0;
+      for (let model = 0; model < models; model++) total += seen[model * MODEL_STRIDE + token];
+      sharedWeights[token] = 1 + 2 * total;
+      sum += sharedWeights[token];
     }
-    for (let token = 0; token < alphabet; token++) shared[token] = Math.floor((1048576 * shared[token]) / sum) + 1;
+    for (let token = 0; token < alphabet; token++) {
+      sharedWeights[token] = Math.floor((SHARED_WEIGHT_SUM * sharedWeights[token]) / sum) + 1;
+    }
   };
 
-  /** @param {number} model */
+  /**
+   * Builds the tables of a model from the weights of the last update.
+   * @param {number} model
+   */
   const buildAdaptive = (model) => {
     const row = model * MODEL_STRIDE;
-    for (let token = 0; token < alphabet; token++) weights[token] = 65536 * seenBefore[row + token] + shared[token];
+    for (let token = 0; token < alphabet; token++) {
+      weights[token] = WEIGHT_PER_TOKEN * seenBefore[row + token] + sharedWeights[token];
+    }
     tables.build(model);
-    builtAt[model] = changes;
+    builtAt[model] = updates;
   };
 
   for (let step = 0; step < steps; step++) {
-    if (step === change) {
-      shareCounts();
-      changes++;
-      change += 1 + (step >> 3);
+    if (step === nextUpdateStep) {
+      updateWeights();
+      updates++;
+      nextUpdateStep += 1 + (step >> 3);
     }
-    const active = step < last ? used : used - 1;
+    const active = step < lastLaneTokens ? usedLanes : usedLanes - 1;
     for (let lane = 0, i = step; lane < active; lane++, i += steps) {
       const model = contexts === null ? laneClasses[lane] : contexts[i] * classes + laneClasses[lane];
-      if (builtAt[model] !== changes) buildAdaptive(model);
+      if (builtAt[model] !== updates) buildAdaptive(model);
       const x = states[lane], low = x & (FREQUENCY_SUM - 1), row = model * MODEL_STRIDE;
       let at = row + firsts[model * BUCKETS_PER_MODEL + (low >> BUCKET_SIZE_LOG2)];
       while (sums[at + 1] <= low) at++;

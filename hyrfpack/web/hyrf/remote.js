@@ -42,6 +42,7 @@ import { HyrfError, HyrfFormatError } from "./errors.js";
  * }} OpenOptions
  */
 
+/** Starts the worker. Bundlers recognise this expression. */
 const createModuleWorker = () => new Worker(new URL("./remote_worker.js", import.meta.url), { type: "module" });
 
 /**

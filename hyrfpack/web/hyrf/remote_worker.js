@@ -36,8 +36,9 @@ let isRunning = false;
  */
 const post = (message, arrays = []) => self.postMessage(message, { transfer: arrays.map(({ buffer }) => buffer) });
 
-/** Waits until the messages that have arrived are handled. A timer would wait for 4 ms. */
 const { port1, port2 } = new MessageChannel();
+
+/** Waits until the messages that have arrived are handled. A timer would wait for 4 ms. */
 const handleMessages = () => new Promise((resolve) => {
   port1.onmessage = resolve;
   port2.postMessage(null);
@@ -118,6 +119,7 @@ const declaredLength = (bytes) =>
   MAGIC_BYTES.every((byte, i) => bytes[i] === byte) ? readUint64(new DataView(bytes.buffer), 16) : 0;
 
 /**
+ * Joins the pieces of a file.
  * @param {Uint8Array[]} parts
  * @param {number} length the sum of their lengths
  */

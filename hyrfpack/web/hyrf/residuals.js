@@ -13,7 +13,7 @@ export const SHAPE_RESIDUALS = 5;
 
 const HEADER_BYTES = 5;
 const BASIS_BYTES = 36;
-const MAX_BASIS_ENTRY = 1 + 2 ** -10;
+const MAX_ABS_BASIS_ENTRY = 1 + 2 ** -10;
 const MAX_CLASSES = 16;
 const MAX_ABS_SYMBOL = 2 ** 24;
 
@@ -34,30 +34,37 @@ export const residualColumns = (degree) => [SHAPE_RESIDUALS, 3 * (degree + 1) **
  */
 export const decodeResiduals = (data, { classes, count }, columns, isColor) => {
   let place = 0;
-  /** @param {number} length */
+  /**
+   * Takes the next bytes.
+   * @param {number} length
+   */
   const take = (length) => {
     assertValid(place + length <= data.length, "it ends too early");
     place += length;
     return data.subarray(place - length, place);
   };
-  const takeView = (/** @type {number} */ length) => {
+  /**
+   * Takes the next bytes as a view of numbers.
+   * @param {number} length
+   */
+  const takeView = (length) => {
     const bytes = take(length);
     return new DataView(bytes.buffer, bytes.byteOffset, length);
   };
   const header = takeView(HEADER_BYTES), classCount = header.getUint8(0);
-  const areClassesKnown = classCount >= 1 && classCount <= MAX_CLASSES && classes.every((each) => each < classCount);
-  assertValid(areClassesKnown, "a class of points has no step size");
+  const areClassesValid = classCount >= 1 && classCount <= MAX_CLASSES && classes.every((each) => each < classCount);
+  assertValid(areClassesValid, "a class of points has no step size");
   const flags = decodeIntegers(take(header.getUint32(1, true)), count, classes, false);
   assertValid(flags.every((flag) => flag <= 1), "a flag is neither 0 nor 1");
   const basis = [];
   if (isColor) {
     const view = takeView(BASIS_BYTES);
     for (let i = 0; i < 9; i++) basis.push(view.getFloat32(4 * i, true));
-    assertValid(basis.every((number) => Math.abs(number) <= MAX_BASIS_ENTRY), "its basis is not orthonormal");
+    assertValid(basis.every((number) => Math.abs(number) <= MAX_ABS_BASIS_ENTRY), "its basis is not orthonormal");
   }
-  const rows = [];
+  const rows = []; // Gaussians that have residuals
   for (let i = 0; i < count; i++) if (flags[i]) rows.push(i);
-  const numbers = new Float32Array(count * columns), values = new Float64Array(count * columns);
+  const values = new Float64Array(count * columns);
   for (let first = 0, band = 0; first < columns; band++) {
     const width = isColor ? 3 * (2 * band + 1) : 2 + band, components = isColor ? 3 : width;
     const codes = take(classCount), contexts = new Uint8Array(rows.length * width);
@@ -75,10 +82,8 @@ export const decodeResiduals = (data, { classes, count }, columns, isColor) => {
     first += width;
   }
   assertValid(place === data.length, `${data.length - place} bytes follow its last band`);
-  if (!isColor) {
-    numbers.set(values);
-    return numbers;
-  }
+  if (!isColor) return new Float32Array(values);
+  const numbers = new Float32Array(count * columns);
   for (const row of rows) {
     for (let at = row * columns; at < (row + 1) * columns; at += 3) {
       for (let k = 0; k < 9; k += 3) {
@@ -122,7 +127,7 @@ export class ColorResiduals {
   }
 
   /**
-   * Returns a channel of a colour with the residuals, after `turn`.
+   * Returns a channel of a colour with its residuals along the direction of the last call of `turn`.
    * @param {number} color
    * @param {number} gaussian the index of the Gaussian
    * @param {number} channel 0 to 2
@@ -135,7 +140,7 @@ export class ColorResiduals {
   }
 
   /**
-   * Evaluates the harmonics along a direction, for the next calls of `corrected`.
+   * Evaluates the harmonics of a direction, for the next calls of `corrected`.
    * @param {Float32Array} directions
    * @param {number} at the index of the direction's x
    */

@@ -2,6 +2,7 @@
 
 import { intersectsFrustum } from "./frustum.js";
 
+/** Rows of Gaussians, and for each the viewpoint from which it was last coloured. */
 export class RowStates {
   /** @param {Float32Array} balls a ball around each row, from `rowBalls` */
   constructor(balls) {
@@ -13,11 +14,11 @@ export class RowStates {
   /**
    * Lists the rows whose colours are out of date.
    * @param {number[]} sides from `frustumPlanes`
-   * @param {number[]} eye
+   * @param {number[]} eye the present viewpoint, in the units of the balls
    * @param {number} angle in radians
-   * @returns {{visible: number, rows: number[]}} `visible` is the number of rows within the planes
-   *   `sides`. `rows` are those among them whose viewing direction has turned by more than `angle` since they were
-   *   coloured, largest turns first; rows that have no colours yet come first of all.
+   * @returns {{visible: number, rows: number[]}} `visible` is the number of rows within the planes `sides`. `rows` are
+   *   those among them whose viewing direction has turned by more than `angle` since they were coloured, largest turns
+   *   first; rows that have no colours yet come first of all.
    */
   stale(sides, eye, angle) {
     const { balls, eyes } = this, angles = new Float64Array(this.count);
@@ -56,7 +57,7 @@ export class RowStates {
   /**
    * Records that a row was coloured.
    * @param {number} row
-   * @param {number[]} eye
+   * @param {number[]} eye the viewpoint of the colours
    */
   colored(row, eye) {
     this.eyes.set(eye, 3 * row);

@@ -7,9 +7,12 @@ export const CODEC_SHARED = 12;
 const SHARED_TYPES = [EXPOSURE_TYPE, ...FIELD_TYPES];
 const CHECKSUM_BYTES = 4;
 const MAX_NAME_LENGTH = 64;
-const FILE_NAME_PATTERN = /^[A-Za-z0-9_][A-Za-z0-9_.-]*\.hyrf$/; // it leads to no other folder
+const FILE_NAME_PATTERN = /^[A-Za-z0-9_][A-Za-z0-9_.-]*\.hyrf$/; // such a name leads to no other folder
 
-/** Files that others refer to, so that each is checked and decoded once. @type {WeakMap<Uint8Array, Container>} */
+/**
+ * The containers of files that others refer to, kept so that each file is checked and decoded once.
+ * @type {WeakMap<Uint8Array, Container>}
+ */
 const openFiles = new WeakMap();
 
 /**
@@ -31,10 +34,10 @@ export const sharedFileName = (container) => {
 };
 
 /**
- * Makes the file to which a file refers its `shared` one.
- * @param {Container} container
- * @param {string} name of the other file
- * @param {Uint8Array} bytes of the other file, whole
+ * Sets `shared` of a file to the file that it refers to.
+ * @param {Container} container that of the referring file
+ * @param {string} name that of the other file
+ * @param {Uint8Array} bytes the other file, whole
  * @throws {HyrfFormatError} the other file is not valid, or is not the one that was referred to
  */
 export const attachShared = (container, name, bytes) => {
@@ -51,7 +54,7 @@ export const attachShared = (container, name, bytes) => {
 };
 
 /**
- * Returns the result of `read`. An error about a file to which others refer gets its name.
+ * Returns the result of `read`. The message of an error begins with the name of the file, if others refer to it.
  * @template Result
  * @param {{name: string}} file
  * @param {() => Result} read

@@ -2,11 +2,12 @@
 
 const RADIX_BINS = 1 << 16;
 
+/** Sorts the same splats again and again, in memory that is allocated once. */
 export class DepthSort {
   /**
-   * @param {Float32Array} positions those of the splats (3 N)
+   * @param {Float32Array} positions those of the splats (3 N); those with NaN are omitted
    * @param {number} width orders fill whole rows of a texture that is `width` texels wide
-   * @param {number[]} [units] of each row's near plane
+   * @param {number[]} [units] for each row, a factor of the depth of the near plane; 1 by default
    */
   constructor(positions, width, units) {
     this.positions = positions;
@@ -26,7 +27,7 @@ export class DepthSort {
    * the planes `sides` are omitted. At equal depth the splat with the larger index comes first, as in the rasteriser.
    * @param {number[]} row the third row of the camera's pose
    * @param {number[]} sides from `frustumPlanes`
-   * @param {number} near the depth of the near plane
+   * @param {number} near the depth of the near plane, before the factors `units`
    * @param {Uint32Array | null} [order] an array to reuse, if its length fits
    * @param {Uint8Array | null} [kept] 0 for each splat to omit
    * @returns {{order: Uint32Array, drawn: number}} indices of splats, of which the first `drawn` are valid
@@ -40,11 +41,11 @@ export class DepthSort {
       const x = positions[3 * i], y = positions[3 * i + 1], z = positions[3 * i + 2];
       const depth = a * x + b * y + c * z + d;
       if (!(depth > (units ? near * units[(i / width) | 0] : near)) || kept?.[i] === 0) continue;
-      let inside = true;
-      for (let s = 0; s < 16 && inside; s += 4) {
-        inside = sides[s] * x + sides[s + 1] * y + sides[s + 2] * z + sides[s + 3] > 0;
+      let isInside = true;
+      for (let s = 0; s < 16 && isInside; s += 4) {
+        isInside = sides[s] * x + sides[s + 1] * y + sides[s + 2] * z + sides[s + 3] > 0;
       }
-      if (!inside) continue;
+      if (!isInside) continue;
       depths[i] = depth;
       indices[drawn++] = i;
       counts[~bits[i] & 0xffff]++;
@@ -69,9 +70,9 @@ export class DepthSort {
 function scatter(from, to, length, counts, key) {
   let start = 0;
   for (let k = 0; k < counts.length; k++) {
-    const here = counts[k];
+    const binCount = counts[k];
     counts[k] = start;
-    start += here;
+    start += binCount;
   }
   for (let k = 0; k < length; k++) to[counts[key(from[k])]++] = from[k];
 }

@@ -55,6 +55,7 @@ export function skySize(metadata) {
   return { width: 2 * height, height, coarseWidth: 2 * coarseHeight, coarseHeight };
 }
 
+/** A model, and which of its rows and of the tiles of its background were evaluated from which viewpoint. */
 export class ViewEvaluator {
   /**
    * @param {Model} model
@@ -202,12 +203,12 @@ function packShapes(positions, { scales, quats }) {
  * @returns {Tile[]}
  */
 function cutTiles(width, height, isCoarse) {
-  const [wide, high] = isCoarse ? [width, height] : [TILE_WIDTH_PIXELS, TILE_HEIGHT_PIXELS];
-  const radius = (BACKGROUND_RADIUS * (Math.PI / height) * Math.hypot(wide, high)) / 2, tiles = [];
-  for (let y = 0; y < height; y += high) {
-    for (let x = 0; x < width; x += wide) {
-      const size = { width: Math.min(wide, width - x), height: Math.min(high, height - y) };
-      const ball = [...pointOnSphere(x + wide / 2, y + high / 2, height), radius];
+  const [tileWidth, tileHeight] = isCoarse ? [width, height] : [TILE_WIDTH_PIXELS, TILE_HEIGHT_PIXELS];
+  const radius = (BACKGROUND_RADIUS * (Math.PI / height) * Math.hypot(tileWidth, tileHeight)) / 2, tiles = [];
+  for (let y = 0; y < height; y += tileHeight) {
+    for (let x = 0; x < width; x += tileWidth) {
+      const size = { width: Math.min(tileWidth, width - x), height: Math.min(tileHeight, height - y) };
+      const ball = [...pointOnSphere(x + tileWidth / 2, y + tileHeight / 2, height), radius];
       tiles.push({ isCoarse, x, y, ...size, pictureHeight: height, ball });
     }
   }

@@ -41,15 +41,16 @@ export function viewpointOf(metadata) {
   const viewpoint = parseStoredViewpoint(provenance.viewpoint) ?? validateViewpoint(defaultViewpoint(frame)) ??
     defaultViewpoint({ center: [0, 0, 0], scale: 1 });
   const up = unit(viewpoint.up), { target } = viewpoint;
-  const { cameras: kept, isCoarse } = storedCameras(metadata);
-  if (!kept.length) {
+  const { cameras: stored, isCoarse } = storedCameras(metadata);
+  if (!stored.length) {
     const others = orbitCameras(viewpoint, ORBIT_CAMERA_COUNT).filter((_, number) => number % 2 === 1);
     const cameras = evenlySpaced(others, MAX_SHOWN_CAMERAS);
     return { cameras, fitted: ringCameras(viewpoint, up), up, target, madeUp: true };
   }
   // Few coarse cameras are stored, too few for fitting colours, so rings of cameras about the scene are added.
-  const fitted = [...evenlySpaced(kept, MAX_FITTED_CAMERAS), ...(isCoarse ? ringCameras(viewpoint, up) : [])];
-  return { cameras: evenlySpaced(kept, MAX_SHOWN_CAMERAS), fitted, up: estimateUp(kept, up), target, madeUp: false };
+  const fitted = [...evenlySpaced(stored, MAX_FITTED_CAMERAS), ...(isCoarse ? ringCameras(viewpoint, up) : [])];
+  const shown = evenlySpaced(stored, MAX_SHOWN_CAMERAS);
+  return { cameras: shown, fitted, up: estimateUp(stored, up), target, madeUp: false };
 }
 
 /**
@@ -163,17 +164,18 @@ function validateViewpoint({ target, up, camera: stored, arc }) {
  * @returns {Camera | null}
  */
 function validateCamera({ width, height, fx, fy, cx, cy, camera_from_world: rows }) {
-  const sides = [width, height].every((side) => Number.isInteger(side) && side >= 1 && side <= MAX_PICTURE_SIDE_PIXELS);
-  if (!sides || ![fx, fy, cx, cy].every(Number.isFinite) || !(fx > 0 && fy > 0)) return null;
+  /** @type {(side: any) => boolean} */
+  const isSide = (side) => Number.isInteger(side) && side >= 1 && side <= MAX_PICTURE_SIDE_PIXELS;
+  if (![width, height].every(isSide) || ![fx, fy, cx, cy].every(Number.isFinite) || !(fx > 0 && fy > 0)) return null;
   if (!Array.isArray(rows) || ![3, 4].includes(rows.length) || !rows.every((row) => isNumberList(row, 4))) return null;
   const pose = [...rows.slice(0, 3), rows[3] ?? [0, 0, 0, 1]].map((row) => [...row]);
   if (!pose.flat().every((value) => Number.isFinite(Math.fround(value)))) return null;
   const [right, down, forward, last] = pose;
-  /** @type {(value: number, wanted: number) => boolean} */
-  const near = (value, wanted) => Math.abs(value - wanted) <= RIGID_TOLERANCE;
+  /** @type {(value: number, expected: number) => boolean} */
+  const isNear = (value, expected) => Math.abs(value - expected) <= RIGID_TOLERANCE;
   const axes = [right, down, forward];
-  const rigid = axes.every((a, i) => axes.every((b, j) => near(dot(a, b), i === j ? 1 : 0)));
-  if (!rigid || !last.every((value, k) => near(value, k === 3 ? 1 : 0))) return null;
+  const isRigid = axes.every((a, i) => axes.every((b, j) => isNear(dot(a, b), i === j ? 1 : 0)));
+  if (!isRigid || !last.every((value, k) => isNear(value, k === 3 ? 1 : 0))) return null;
   if (dot(cross(right, down), forward) < 0) return null; // it mirrors the world
   return { width, height, fx, fy, cx, cy, camera_from_world: pose };
 }
@@ -217,9 +219,9 @@ function orbitCameras({ target, up: stored, camera, arc: [first, last] }, count)
     offset = add(offset, mul(perpendicularTo(up), 0.5 * Math.max(Math.hypot(...offset), 1e-6)));
   }
   return Array.from({ length: count }, (_, k) => {
-    const part = k / count;
-    const swing = (first + last) / 2 + ((last - first) / 2) * Math.sin(2 * Math.PI * part);
-    const angle = last - first >= 360 ? first + (last - first) * part : swing;
+    const turn = k / count;
+    const swing = (first + last) / 2 + ((last - first) / 2) * Math.sin(2 * Math.PI * turn);
+    const angle = last - first >= 360 ? first + (last - first) * turn : swing;
     const place = add(target, rotate(offset, up, (angle * Math.PI) / 180));
     return { ...camera, camera_from_world: lookAtPose(place, target, up) };
   });
@@ -279,6 +281,6 @@ function lookAtPose(place, target, up) {
  * @param {number[]} axis
  */
 function perpendicularTo(axis) {
-  const sizes = axis.map(Math.abs), least = sizes.indexOf(Math.min(...sizes));
-  return unit(cross(axis, [0, 1, 2].map((k) => (k === least ? 1 : 0))));
+  const sizes = axis.map(Math.abs), smallest = sizes.indexOf(Math.min(...sizes));
+  return unit(cross(axis, [0, 1, 2].map((k) => (k === smallest ? 1 : 0))));
 }

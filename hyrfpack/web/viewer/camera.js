@@ -8,13 +8,14 @@ import { add, cross, dot, mul, rotate, sub, unit } from "../hyrf/vectors.js";
 const POSE_TOLERANCE = 1e-3; // the maximum error of the dot products of a pose's rows
 const MAX_ELEVATION_RADIANS = 1.55;
 
+// Returns whether a value is a row of a pose: four finite numbers.
 const isPoseRow = (row) => Array.isArray(row) && row.length === 4 && row.every(Number.isFinite);
 
 // Returns whether three rows are a rotation matrix.
 function isRigid(rows) {
-  const near = (a, b, wanted) => Math.abs(dot(a, b) - wanted) <= POSE_TOLERANCE;
-  const right = rows.every((a, i) => rows.every((b, j) => near(a, b, i === j ? 1 : 0)));
-  return right && dot(cross(rows[0], rows[1]), rows[2]) > 0;
+  const hasProduct = (a, b, expected) => Math.abs(dot(a, b) - expected) <= POSE_TOLERANCE;
+  const isOrthonormal = rows.every((a, i) => rows.every((b, j) => hasProduct(a, b, i === j ? 1 : 0)));
+  return isOrthonormal && dot(cross(rows[0], rows[1]), rows[2]) > 0;
 }
 
 // Converts a point in world units to the page's coordinates.
@@ -26,8 +27,8 @@ export const toWorld = (point, scene) => add(scene.center, mul(rotateBy(frameAxe
 // Converts a camera in world units, {width, height, fx, fy, cx, cy, camera_from_world: 4 x 4 rows}, to a view. The last
 // row may be absent. Throws an Error that says what is wrong with an invalid camera.
 export function viewOf({ width, height, fx, fy, cx, cy, camera_from_world: pose }, scene) {
-  const posed = Array.isArray(pose) && [3, 4].includes(pose.length) && pose.every(isPoseRow);
-  if (!posed || ![width, height, fx, fy, cx, cy].every(Number.isFinite)) {
+  const hasPose = Array.isArray(pose) && [3, 4].includes(pose.length) && pose.every(isPoseRow);
+  if (!hasPose || ![width, height, fx, fy, cx, cy].every(Number.isFinite)) {
     throw new Error("it needs width, height, fx, fy, cx, cy and camera_from_world (4 x 4), all of them numbers");
   }
   if (![width, height].every((side) => Number.isInteger(side) && side > 0)) {
@@ -156,9 +157,9 @@ export class Eye {
   // Multiplies the distance to a point at the target's depth by a factor; factors below 1 move the eye nearer. The
   // point keeps its place in the picture, which x and y give as for `point`.
   zoom(factor, x, y) {
-    const least = (1e-3 * this.pace) / this.depth;
+    const minFactor = (1e-3 * this.pace) / this.depth;
     const point = this.point(x, y);
-    factor = Math.max(factor, least);
+    factor = Math.max(factor, minFactor);
     this.position = add(point, mul(sub(this.position, point), factor));
     this.target = add(point, mul(sub(this.target, point), factor));
   }

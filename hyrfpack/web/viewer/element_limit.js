@@ -16,12 +16,14 @@ export function addView(view) {
   for (const observer of observers) observer.observe(view.element);
 }
 
+// Removes a view, whose place another one may take.
 export function removeView(view) {
   views.delete(view);
   for (const observer of observers) observer.unobserve(view.element);
   assignScenes();
 }
 
+// Returns an observer that keeps a field of views up to date: whether their element is in the window and its margin.
 function makeObserver(field, rootMargin) {
   const follow = (entries) => {
     for (const { target, isIntersecting } of entries) {
@@ -37,15 +39,17 @@ function makeObserver(field, rootMargin) {
   return new IntersectionObserver(follow, { rootMargin });
 }
 
+// Returns how near the window a view is: 2 in it, 1 near it, 0 elsewhere.
 const rankOf = ({ isVisible, isNear }) => Number(isVisible) + Number(isNear);
+// Returns whether a view has a viewer, or waits for one that it may have now.
 const wantsViewer = (view) => view.viewer || (view.isPending && (view.isNear || view.isEager));
 
 // Opens the views that come first, and closes the others.
 export function assignScenes() {
-  const wanted = [...views].reverse().filter(wantsViewer);
-  wanted.sort((a, b) => rankOf(b) - rankOf(a) || Boolean(b.viewer) - Boolean(a.viewer));
-  for (const view of wanted.slice(MAX_SCENES)) view.suspend(); // before others open, so that the limit always holds
-  for (const view of wanted.slice(0, MAX_SCENES)) view.open();
+  const candidates = [...views].reverse().filter(wantsViewer);
+  candidates.sort((a, b) => rankOf(b) - rankOf(a) || Boolean(b.viewer) - Boolean(a.viewer));
+  for (const view of candidates.slice(MAX_SCENES)) view.suspend(); // before others open, so that the limit always holds
+  for (const view of candidates.slice(0, MAX_SCENES)) view.open();
 }
 
 // Handles the loss of a view's context. The browser restores one that it took away once there is room for it.

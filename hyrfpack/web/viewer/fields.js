@@ -13,7 +13,8 @@ const LEVELS_PER_LAYER = 4; // of features, two halves a level
 const MAX_CELLS = 32; // a cell is 8 hidden units; the shaders hold all cells in variables
 const WEIGHTS_TEXTURE_WIDTH = 1024; // of the texture for a decoder's numbers if no uniform block is used
 const WEIGHTS_TEXTURE_UNIT = 6;
-const FIRST_REFRESH_MS = 1000; // after this time a view at rest is drawn again while rows are coloured, then less often
+// A view at rest is drawn again after this time while its rows are coloured, and then less often.
+const FIRST_REFRESH_MS = 1000;
 const MAX_FRESH_TURN_RADIANS = 2e-3; // a larger turn of its viewing direction makes a row's colours stale
 const MOVING_SKY_RATIO = 0.4; // while moving, the share of the time for colours in which a background is quick
 const MOVING_ROWS_DIVISOR = 8; // while moving, a frame colours at most this part of the visible rows
@@ -56,6 +57,7 @@ export class Fields {
     model.coarseBackground = null;
   }
 
+  // Uploads the estimate of the Gaussians.
   async uploadEstimate() {
     const { gl, graphics, model, model: { estimate } } = this;
     const words = [gl.RGBA32UI, gl.RGBA_INTEGER, gl.UNSIGNED_INT, 4];
@@ -180,8 +182,8 @@ export class Fields {
       colors: buildFieldShader("colors.frag", { ...deep(radiance), ...turned, ...residuals }),
     };
     if (!background) return shaders;
-    const behind = { ...deep(radiance), ...placed, ...turned, BACKGROUND: 1 };
-    for (const name of ["panorama", "sky"]) shaders[name] = buildFieldShader(`${name}.frag`, behind);
+    const backgroundConstants = { ...deep(radiance), ...placed, ...turned, BACKGROUND: 1 };
+    for (const name of ["panorama", "sky"]) shaders[name] = buildFieldShader(`${name}.frag`, backgroundConstants);
     return shaders;
   }
 
@@ -189,9 +191,9 @@ export class Fields {
   supports(count) {
     const { gl, graphics } = this;
     const framebuffer = graphics.framebuffer(...Array.from({ length: count }, (_, k) => [this.features, k]));
-    const whole = gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
+    const isComplete = gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
     graphics.free(framebuffer);
-    return whole;
+    return isComplete;
   }
 
   // Selects the program of a pass and binds the field's buffers.
@@ -312,8 +314,8 @@ export class Fields {
   recolor(view, margin, ms, follows) {
     if (!this.isReady) return;
     const { visible, rows } = this.rows.stale(frustumPlanes(view, margin), view.eye, MAX_FRESH_TURN_RADIANS);
-    const most = Math.min(this.pace.within(ms), Math.ceil(visible / MOVING_ROWS_DIVISOR));
-    if (rows.length) this.color(rows.slice(0, most), view.eye);
+    const maxRows = Math.min(this.pace.within(ms), Math.ceil(visible / MOVING_ROWS_DIVISOR));
+    if (rows.length) this.color(rows.slice(0, maxRows), view.eye);
     const { panorama, sky } = this;
     if (follows && sky?.follow(view, panorama.texelMs, MOVING_SKY_RATIO * ms)) return;
     panorama?.advance(view, ms);

@@ -9,6 +9,7 @@ const NUMBERS_PER_UPLOAD = 1 << 19; // more would keep the page's thread for too
 export class ContextLostError extends Error {}
 
 const contextChanges = new WeakMap(); // context -> the number of its losses and restorations
+// Returns the number of losses and restorations of a context.
 const contextChangesOf = (gl) => contextChanges.get(gl) ?? 0;
 
 // Records that a context was lost or restored, which makes all earlier objects invalid.
@@ -19,6 +20,7 @@ export function countContextChange(gl) {
 const softwareContexts = new WeakMap(); // context -> whether it draws in software
 
 export class Graphics {
+  // `gl` is a WebGL 2 context.
   constructor(gl) {
     this.gl = gl;
     // The first object of a context asks for the name of its device, which would later block the page.
@@ -91,10 +93,10 @@ export class Graphics {
   async table([internal, format, type, size], width, numbers) {
     const { gl } = this, texels = numbers.length / size, whole = Math.floor(texels / width);
     const texture = this.texture(gl.TEXTURE_2D, internal, width, Math.max(1, Math.ceil(texels / width)));
-    const upload = (row, wide, high) => {
+    const upload = (row, columns, rows) => {
       gl.bindTexture(gl.TEXTURE_2D, texture);
-      const part = numbers.subarray(row * width * size, (row * width + wide * high) * size);
-      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, wide, high, format, type, part);
+      const part = numbers.subarray(row * width * size, (row * width + columns * rows) * size);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, columns, rows, format, type, part);
     };
     const step = Math.max(1, Math.floor(NUMBERS_PER_UPLOAD / (width * size)));
     for (let row = 0; row < whole; row += step) {
@@ -156,19 +158,20 @@ export class Graphics {
     return { program };
   }
 
-  // Adds the locations of a program's uniforms by their names. Throws an error if the program does not link.
-  link(found, what) {
-    const { gl } = this, { program } = found, shaders = gl.getAttachedShaders(program) ?? [];
+  // Adds to a {program} of `compile` the locations of its uniforms by their names. Throws an error, which names the
+  // program by `name`, if it does not link.
+  link(linked, name) {
+    const { gl } = this, { program } = linked, shaders = gl.getAttachedShaders(program) ?? [];
     if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !this.lost) {
       const logs = shaders.map((shader) => gl.getShaderInfoLog(shader)).join(" ");
-      throw new Error(`The graphics driver refuses ${what}: ${gl.getProgramInfoLog(program)} ${logs}`);
+      throw new Error(`The graphics driver refuses ${name}: ${gl.getProgramInfoLog(program)} ${logs}`);
     }
     for (const shader of shaders) gl.deleteShader(shader);
     for (let k = 0; k < gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS); k++) {
-      const { name } = gl.getActiveUniform(program, k);
-      found[name.replace("[0]", "")] = gl.getUniformLocation(program, name);
+      const { name: uniform } = gl.getActiveUniform(program, k);
+      linked[uniform.replace("[0]", "")] = gl.getUniformLocation(program, uniform);
     }
-    return found;
+    return linked;
   }
 
   // Starts to compile a program of two shader files.
@@ -179,13 +182,13 @@ export class Graphics {
   // Finishes programs, {name: program}, like `link`. The page is not blocked if the driver compiles in parallel.
   async compiled(programs) {
     const { gl } = this, parallel = gl.getExtension("KHR_parallel_shader_compile");
-    for (const found of Object.values(programs)) {
-      const pending = () => parallel && !gl.getProgramParameter(found.program, parallel.COMPLETION_STATUS_KHR);
+    for (const compiled of Object.values(programs)) {
+      const pending = () => parallel && !gl.getProgramParameter(compiled.program, parallel.COMPLETION_STATUS_KHR);
       while (!this.lost && pending()) await waitForPoll();
     }
-    for (const [name, found] of Object.entries(programs)) {
+    for (const [name, compiled] of Object.entries(programs)) {
       await this.whenDone(); // `link` asks the device, which would block the page while it works
-      this.link(found, name);
+      this.link(compiled, name);
     }
   }
 
@@ -211,6 +214,7 @@ function deviceName(gl) {
   return debugInfo ? gl.getParameter(debugInfo.UNMASKED_RENDERER_WEBGL) : name;
 }
 
+// Waits until it is worth asking the device again.
 const waitForPoll = () => new Promise((resolve) => setTimeout(resolve, POLL_INTERVAL_MS));
 
 // Divides work into slices of about SLICE_MS of device time, so that the device can draw frames between them, and that

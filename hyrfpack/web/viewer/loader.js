@@ -140,6 +140,7 @@ export class Loader {
     this.connection.post({ use: number });
   }
 
+  // Returns whether an order is being made.
   get busy() {
     return this.waiting.size > 0;
   }
@@ -155,6 +156,7 @@ export class Loader {
     return this.failure ? null : new Promise((resolve) => this.waiting.set(ticket, resolve));
   }
 
+  // Passes an order to the `sort` that asked for it.
   sorted(answer) {
     this.waiting.get(answer.ticket)(answer.number === this.current ? answer : null);
     this.waiting.delete(answer.ticket);
@@ -168,6 +170,7 @@ export class Loader {
     return new Promise((resolve, reject) => this.asked.set(ticket, { resolve, reject }));
   }
 
+  // Settles the promise of the `ask` to which the worker has answered.
   answered({ ticket, value, error }) {
     const { resolve, reject } = this.asked.get(ticket);
     this.asked.delete(ticket);
@@ -180,10 +183,12 @@ export class Loader {
     this.spare = order;
   }
 
+  // Ends the work on the file.
   dispose() {
     this.connection.close();
     this.end(new SupersededError("another file was opened instead"), new SupersededError());
   }
 }
 
+// Returns the error for a worker that has failed.
 const failureOf = (reason) => new Error(`The player's worker has failed (${reason}); load the page again.`);

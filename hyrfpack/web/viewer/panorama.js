@@ -22,8 +22,8 @@ export class Panorama {
   constructor(graphics, { finest, halfExtent, backgroundSpacing }, coarse, paint) {
     Object.assign(this, { graphics, paint, texture: coarse });
     this.pace = new WorkPacer();
-    const enough = Math.ceil(Math.PI * Math.min(finest / Math.min(...halfExtent), 1 / backgroundSpacing));
-    this.height = Math.min(MAX_HEIGHT_TEXELS, Math.max(MIN_HEIGHT_TEXELS, enough));
+    const finestHeight = Math.ceil(Math.PI * Math.min(finest / Math.min(...halfExtent), 1 / backgroundSpacing));
+    this.height = Math.min(MAX_HEIGHT_TEXELS, Math.max(MIN_HEIGHT_TEXELS, finestHeight));
   }
 
   // Returns the time in ms that a texel takes, or NaN if it is not known yet.
@@ -53,14 +53,15 @@ export class Panorama {
   // Returns the tiles. Each has its part of the picture, a ball around that part of the sphere, and the `eye` from
   // which it was drawn, or null.
   cut() {
-    const { height } = this, tiles = [], [wide, high] = TILE_SIZE_TEXELS, angle = Math.PI / height; // per texel
-    const radius = (BACKGROUND_RADIUS * angle * Math.hypot(wide, high)) / 2;
-    for (let y = 0; y < height; y += high) {
-      for (let x = 0; x < 2 * height; x += wide) {
-        const longitude = angle * (x + wide / 2) - Math.PI, latitude = Math.PI / 2 - angle * (y + high / 2);
+    const { height } = this, tiles = [], [tileWidth, tileHeight] = TILE_SIZE_TEXELS;
+    const angle = Math.PI / height; // per texel
+    const radius = (BACKGROUND_RADIUS * angle * Math.hypot(tileWidth, tileHeight)) / 2;
+    for (let y = 0; y < height; y += tileHeight) {
+      for (let x = 0; x < 2 * height; x += tileWidth) {
+        const longitude = angle * (x + tileWidth / 2) - Math.PI, latitude = Math.PI / 2 - angle * (y + tileHeight / 2);
         const [across, ahead] = [Math.sin(longitude), Math.cos(longitude)].map((side) => side * Math.cos(latitude));
         const middle = [across, -Math.sin(latitude), ahead].map((side) => BACKGROUND_RADIUS * side);
-        const part = [x, y, Math.min(wide, 2 * height - x), Math.min(high, height - y)];
+        const part = [x, y, Math.min(tileWidth, 2 * height - x), Math.min(tileHeight, height - y)];
         tiles.push({ part, middle, radius, eye: null });
       }
     }
@@ -75,6 +76,7 @@ export class Panorama {
       .sort((a, b) => Boolean(a.eye) - Boolean(b.eye) || ahead(b) - ahead(a));
   }
 
+  // Draws tiles with the colours that an eye sees.
   draw(tiles, eye) {
     for (const tile of tiles) {
       this.paint(this.target, this.size, tile.part, eye);

@@ -100,6 +100,7 @@ export class Player extends EventTarget {
     this.observer.observe(canvas);
   }
 
+  // Creates a renderer of the player's class for its canvas.
   createRenderer() {
     return new this.rendererClass(this.canvas, () => this.onDeviceLost());
   }
@@ -189,7 +190,7 @@ export class Player extends EventTarget {
     for (const { reject } of this.onIdle.splice(0)) reject(error);
   }
 
-  // Stops to draw a file whose worker has failed. What the canvas shows stays there.
+  // Stops drawing a file whose worker has failed. What the canvas shows stays there.
   breakDown(loader, error, isReported) {
     if (loader === this.loader) {
       this.loaded = this.idle = false;
@@ -357,6 +358,7 @@ export class Player extends EventTarget {
     if (!this.lost) this.makeContentsAgain();
   }
 
+  // Draws nothing until the device is back, and says so.
   stopDrawing() {
     this.loaded = false;
     this.idle = false; // the picture is incomplete until the device is restored
@@ -474,6 +476,7 @@ export class Player extends EventTarget {
     this.paused = true;
   }
 
+  // Draws again after `pause`.
   resume() {
     this.paused = false;
     this.wake();
@@ -557,10 +560,10 @@ export class Player extends EventTarget {
     if (!this.moving) return;
     this.emit("frame", this.took);
     if (this.automatic) {
-      const wanted = this.coarse * Math.min(1.15, Math.sqrt(TARGET_FRAME_MS / took));
+      const target = this.coarse * Math.min(1.15, Math.sqrt(TARGET_FRAME_MS / took));
       // Small changes of the resolution would be visible as jitter, and save little time.
       const isOffTarget = took > 1.3 * TARGET_FRAME_MS || took < 0.7 * TARGET_FRAME_MS;
-      if (isOffTarget) this.coarse = Math.min(1, Math.max(MIN_SCALE, wanted));
+      if (isOffTarget) this.coarse = Math.min(1, Math.max(MIN_SCALE, target));
     }
   }
 
@@ -592,14 +595,15 @@ export class Player extends EventTarget {
   // Runs work on the content after all earlier work on it. Returns a promise of its result, or of null if the context
   // was lost.
   enqueue(work) {
-    const done = this.queue.then(work).catch((error) => {
+    const result = this.queue.then(work).catch((error) => {
       if (!(error instanceof ContextLostError)) throw error;
       return null;
     });
-    this.queue = done.catch(() => {});
-    return done;
+    this.queue = result.catch(() => {});
+    return result;
   }
 
+  // Returns the view of an eye for a picture of the canvas' size.
   view(eye = this.eye) {
     return eye.view(this.canvas.width, this.canvas.height);
   }

@@ -214,11 +214,11 @@ export class Renderer {
     const { gl } = this;
     const place = [Math.floor(x), Math.floor(y), 1, 1];
     this.splats(view, { pick: scale }, place);
-    const found = this.fine ? new Float32Array(4) : new Uint8Array(4);
-    gl.readPixels(...place, gl.RGBA, this.fine ? gl.FLOAT : gl.UNSIGNED_BYTE, found);
-    const [value, , , alpha] = found;
-    const share = value / alpha; // z / (z + scale)
-    return alpha > (this.fine ? 0.1 : 25) && share < 1 ? (scale * share) / (1 - share) : null;
+    const pixel = this.fine ? new Float32Array(4) : new Uint8Array(4);
+    gl.readPixels(...place, gl.RGBA, this.fine ? gl.FLOAT : gl.UNSIGNED_BYTE, pixel);
+    const [value, , , alpha] = pixel;
+    const mean = value / alpha; // z / (z + scale)
+    return alpha > (this.fine ? 0.1 : 25) && mean < 1 ? (scale * mean) / (1 - mean) : null;
   }
 
   // Returns whether the last frame is still being drawn.
@@ -327,9 +327,9 @@ export class Renderer {
     gl.bindFramebuffer(gl.FRAMEBUFFER, target);
     gl.viewport(0, 0, view.width, view.height);
     gl.useProgram(r.program);
-    const behind = { u_background: picture ?? this.plain, u_sky: sky?.texture ?? this.plain };
+    const backgrounds = { u_background: picture ?? this.plain, u_sky: sky?.texture ?? this.plain };
     const { colors, logs } = this.surfaces;
-    graphics.bind(r, { u_splats: colors.texture, ...behind, u_logs: partLogs ? logs.texture : this.plain });
+    graphics.bind(r, { u_splats: colors.texture, ...backgrounds, u_logs: partLogs ? logs.texture : this.plain });
     gl.uniform4f(r.u_log_behind, ...(partLogs?.[0].map(encodeLog) ?? [0, 0, 0]), partLogs ? 1 : 0);
     gl.uniform1i(r.u_pictured, picture ? 1 : 0);
     gl.uniform2f(r.u_stride, (stride * view.width) / whole.width, (stride * view.height) / whole.height);
@@ -358,6 +358,7 @@ export class Renderer {
     for (const name of Object.keys(this.surfaces)) this.free(name);
   }
 
+  // Frees the target of blended "colors" or "logs".
   free(name) {
     for (const object of [this.surfaces[name]?.texture, this.surfaces[name]?.target]) this.graphics.free(object);
     this.surfaces[name] = null;
@@ -392,6 +393,7 @@ export function lowPassVariances(scales) {
   return [...full, ...full.map((variance, axis) => variance + (1 - scales[axis] ** 2) / 12)];
 }
 
+// Returns whether a view is one of `reduceView` with fewer pixels than at its full resolution.
 export const isReduced = ({ scales }) => scales !== undefined && Math.min(...scales) < 1;
 
 // Returns a view at about `scale` times its resolution, with more rows than columns.

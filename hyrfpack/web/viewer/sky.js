@@ -74,6 +74,7 @@ export class Sky {
     this.marked = graphics.framebuffer(this.needed);
   }
 
+  // Clears the colours of all nodes.
   clearNodes() {
     this.clear(this.target, 0);
   }
@@ -86,6 +87,7 @@ export class Sky {
     gl.clear(gl.COLOR_BUFFER_BIT);
   }
 
+  // Marks all nodes as needed.
   markAll() {
     this.clear(this.marked, 1);
   }
@@ -107,12 +109,12 @@ export class Sky {
   async complete({ goOn, changed }) {
     const { graphics, tiles, view, pace, size, stride } = this;
     if (!tiles.length) return true;
-    const whole = await pace.run(graphics, tiles.length, (first, last) => {
+    const isComplete = await pace.run(graphics, tiles.length, (first, last) => {
       for (const tile of tiles.slice(first, last)) this.paint(this.target, size, tile, view, this.needed, stride);
     }, { goOn });
-    if (whole) this.tiles = [];
+    if (isComplete) this.tiles = [];
     changed();
-    return whole;
+    return isComplete;
   }
 }
 
@@ -133,4 +135,5 @@ function cutTiles(width, height) {
   return tiles.map((_, k) => tiles[(k * step) % tiles.length]);
 }
 
+// Returns the greatest common divisor (Euclid's algorithm).
 const greatestDivisor = (a, b) => (b ? greatestDivisor(b, a % b) : a);

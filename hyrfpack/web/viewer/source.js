@@ -16,6 +16,7 @@ export async function openSource(source, name, aborter) {
   return { ...file, name: name ?? file.name };
 }
 
+// Opens a source under its own name.
 async function openUnnamed(source, aborter) {
   if (typeof source === "string" || source instanceof URL) return fetchedFile(absoluteAddress(source), aborter);
   if (source instanceof Blob) return chosenFile(source);
@@ -25,6 +26,7 @@ async function openUnnamed(source, aborter) {
   throw new Error("A scene is an address, a Blob, an ArrayBuffer, a Uint8Array or a ReadableStream.");
 }
 
+// Returns an address in full. Throws an Error with a message for the user if it is none.
 function absoluteAddress(source) {
   try {
     return new URL(source, document.baseURI).href;
@@ -49,6 +51,7 @@ async function* copyPieces(reader) {
   }
 }
 
+// Returns a copy of the bytes of any typed array.
 const copyBytes = ({ buffer, byteOffset, byteLength }) => new Uint8Array(buffer, byteOffset, byteLength).slice();
 
 // Fetches a file. Throws an Error with a message for the user on failure.
@@ -104,26 +107,26 @@ async function request(address, name, { signal }, headers = {}) {
 // Yields the bytes of an answer. After a broken connection, the rest is requested once, by a range request.
 async function* downloaded(address, name, answer, length, aborter) {
   const isSameOrigin = new URL(address).origin === location.origin, tag = answer.headers.get("ETag");
-  let done = 0;
+  let received = 0;
   for (let isResumed = false; ; isResumed = true) {
     try {
       for await (const bytes of pieces(answer.body.getReader())) {
-        done += bytes.length;
+        received += bytes.length;
         yield bytes;
       }
       // Other servers do not reveal that a transfer is compressed, so its length may not be that of the file.
-      if (done >= length || !isSameOrigin) return;
+      if (received >= length || !isSameOrigin) return;
       throw new Error(); // as for a connection that the browser calls broken
     } catch {
-      const sentence = `the connection broke after ${done.toLocaleString("en")} bytes; reload the page to try again`;
-      const brokenError = new Error(sentence);
-      if (isResumed || !done || aborter.signal.aborted) throw brokenError;
+      const size = received.toLocaleString("en");
+      const brokenError = new Error(`the connection broke after ${size} bytes; reload the page to try again`);
+      if (isResumed || !received || aborter.signal.aborted) throw brokenError;
       // If-Range is sent only to the page's own server, because other servers would have to allow it.
       const condition = isSameOrigin && tag && !tag.startsWith("W/") ? { "If-Range": tag } : {};
-      const headers = { Range: `bytes=${done}-`, ...condition };
+      const headers = { Range: `bytes=${received}-`, ...condition };
       answer = await request(address, name, aborter, headers);
       const first = answer.headers.get("Content-Range");
-      if (answer.status !== 206 || (first && !first.startsWith(`bytes ${done}-`))) {
+      if (answer.status !== 206 || (first && !first.startsWith(`bytes ${received}-`))) {
         aborter.abort();
         throw brokenError;
       }

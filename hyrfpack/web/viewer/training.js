@@ -11,7 +11,8 @@ const REQUEST_INTERVAL_MS = 2000;
 const WAIT_PER_LOAD_RATIO = 3; // the wait after a snapshot is at least this many times its loading time
 const MAX_FAILURES = 3; // after this many consecutive failed requests, the run counts as ended
 
-const wait = (duration) => new Promise((done) => setTimeout(done, duration));
+// Waits for a time in ms.
+const wait = (duration) => new Promise((resolve) => setTimeout(resolve, duration));
 
 // Requests the progress {snapshot, step, steps, kind}; `snapshot` counts from 1 and is 0 while there is none, `kind`
 // names a run that is not the main one. Returns null if the server does not answer.

@@ -152,6 +152,7 @@ class Viewer {
     this.applyPause();
   }
 
+  // Pauses or resumes the player, as the page, the window and screenshots need it.
   applyPause() {
     if ((this.isPaused || !this.isVisible) && !this.screenshots) this.player.pause();
     else this.player.resume();
@@ -187,6 +188,7 @@ class Viewer {
     return this.currentLoad !== null && this.player.loader?.origin === this.currentLoad;
   }
 
+  // Opens the source of a load, and emits what comes of it.
   async show(load, src, name) {
     const { player } = this, isDropped = () => this.currentLoad !== load;
     try {
@@ -315,6 +317,7 @@ class Viewer {
 
 const DESTROYED_TEXT = "The viewer has been destroyed; create another one.";
 const CANCELLED_TEXT = "The load was cancelled: another scene was loaded, or the viewer was destroyed.";
+// Returns the error with which a load that was cancelled is rejected.
 const newAbortError = () => new DOMException(CANCELLED_TEXT, "AbortError");
 
 // Throws an Error if a value is not one of the allowed ones.
@@ -334,6 +337,7 @@ function findContainer(container) {
   throw new Error("createViewer needs a container: element or selector.");
 }
 
+// Returns the address of the worker's script in full. Throws an Error if it is none.
 function resolveWorker(address) {
   try {
     return new URL(address, document.baseURI).href;

@@ -21,6 +21,7 @@ export class Connection {
     this.shared.connections.set(this.number, this);
   }
 
+  // Sends a message to the reader, with buffers that are transferred.
   post(message, transfers = []) {
     this.shared?.worker.postMessage({ reader: this.number, ...message }, transfers);
   }
@@ -47,6 +48,7 @@ function chooseWorker(address) {
   return same.reduce((best, shared) => (shared.connections.size < best.connections.size ? shared : best));
 }
 
+// Starts a worker, and adds it to the pool.
 function startWorker(address) {
   const shared = { worker: createWorker(address), address, connections: new Map() };
   shared.worker.onmessage = ({ data: { reader, ...message } }) => shared.connections.get(reader)?.receive(message);
@@ -70,6 +72,7 @@ function trust(address) {
   }
 }
 
+// Creates a worker from the script at an address, or from the embedded one if it is null.
 function createWorker(address) {
   if (address) return new Worker(trust(address));
   const embedded = URL.createObjectURL(new Blob([readText("worker.js")], { type: "text/javascript" }));

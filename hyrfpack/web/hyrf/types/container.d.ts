@@ -18,6 +18,8 @@ export declare const MAGIC_BYTES: number[];
 export declare const HEADER_BYTES = 48;
 export declare const ENTRY_BYTES = 40;
 export declare const MAX_SECTIONS = 1024;
+/** The maximum length of a file, and of all its sections after decoding. */
+export declare const MAX_FILE_BYTES: number;
 /**
  * Returns the largest number of bytes that all sections of a file of `length` bytes may decode to.
  * @param {number} length

@@ -13,29 +13,30 @@ export declare class DamagedData extends Error {
 }
 /**
  * Throws the error for a damaged file.
- * @param {string} what the reason
+ * @param {string} reason
  * @returns {never}
  */
-export declare const rejectDamaged: (what: string) => never;
+export declare const rejectDamaged: (reason: string) => never;
 /**
  * Throws the error for a file that needs a newer reader.
- * @param {string} what the reason
+ * @param {string} reason
  * @returns {never}
  */
-export declare const rejectNewer: (what: string) => never;
+export declare const rejectNewer: (reason: string) => never;
 /**
- * Returns bytes that a caller passes. A Uint8Array of another frame is accepted, whose class is another one.
+ * Returns bytes that a caller passes. It also accepts a Uint8Array of another frame of the page, which is of another
+ * class.
  * @param {Uint8Array} value
- * @param {string} what the name of the file
+ * @param {string} name that of the bytes, for the message
  * @throws {TypeError} it is no Uint8Array
  */
-export declare const requireBytes: (value: Uint8Array, what: string) => Uint8Array<ArrayBufferLike>;
+export declare const requireBytes: (value: Uint8Array, name: string) => Uint8Array<ArrayBufferLike>;
 /**
  * Throws DamagedData unless a condition holds.
  * @param {boolean} holds whether the condition holds
- * @param {string} what the reason
+ * @param {string} reason what is wrong if it does not hold
  */
-export declare const assertValid: (holds: boolean, what: string) => void;
+export declare const assertValid: (holds: boolean, reason: string) => void;
 /**
  * Returns an error, or one with a clear message in place of that for an array that is too long for the memory.
  * @param {any} error

@@ -64,13 +64,13 @@ export declare const tableRows: (grid: Grid) => number;
 /**
  * Returns the three layers of a field's decoder.
  * @param {DecoderConfig} config
- * @param {FieldName} which
+ * @param {FieldName} field
  * @returns {DecoderLayer[]}
  */
-export declare const decoderLayout: (config: DecoderConfig, which: FieldName) => DecoderLayer[];
+export declare const decoderLayout: (config: DecoderConfig, field: FieldName) => DecoderLayer[];
 /**
  * Returns the number of weights and biases of a field's decoder.
  * @param {DecoderConfig} config
- * @param {FieldName} which
+ * @param {FieldName} field
  */
-export declare const decoderSize: (config: DecoderConfig, which: FieldName) => number;
+export declare const decoderSize: (config: DecoderConfig, field: FieldName) => number;

@@ -7,7 +7,9 @@ export type View = import("./frustum.js").View & {
     eye?: number[];
 };
 /**
+ * Where a part lies: `rows` are those of the rotation from the part's local axes to those of the scene.
  * @typedef {{rows: number[][], scale: number, shift: number[]}} Place
+ *
  * @typedef {import("./frustum.js").View & {eye?: number[]}} View
  */
 /** The place of the scene itself. @type {Place} */

@@ -1,3 +1,4 @@
+/** Rows of Gaussians, and for each the viewpoint from which it was last coloured. */
 export declare class RowStates {
     balls: Float32Array<ArrayBufferLike>;
     count: number;
@@ -7,11 +8,11 @@ export declare class RowStates {
     /**
      * Lists the rows whose colours are out of date.
      * @param {number[]} sides from `frustumPlanes`
-     * @param {number[]} eye
+     * @param {number[]} eye the present viewpoint, in the units of the balls
      * @param {number} angle in radians
-     * @returns {{visible: number, rows: number[]}} `visible` is the number of rows within the planes
-     *   `sides`. `rows` are those among them whose viewing direction has turned by more than `angle` since they were
-     *   coloured, largest turns first; rows that have no colours yet come first of all.
+     * @returns {{visible: number, rows: number[]}} `visible` is the number of rows within the planes `sides`. `rows` are
+     *   those among them whose viewing direction has turned by more than `angle` since they were coloured, largest turns
+     *   first; rows that have no colours yet come first of all.
      */
     stale(sides: number[], eye: number[], angle: number): {
         visible: number;
@@ -28,7 +29,7 @@ export declare class RowStates {
     /**
      * Records that a row was coloured.
      * @param {number} row
-     * @param {number[]} eye
+     * @param {number[]} eye the viewpoint of the colours
      */
     colored(row: number, eye: number[]): void;
 }

@@ -1,3 +1,4 @@
+/** Sorts the same splats again and again, in memory that is allocated once. */
 export declare class DepthSort {
     positions: Float32Array<ArrayBufferLike>;
     width: number;
@@ -10,9 +11,9 @@ export declare class DepthSort {
     others: Uint32Array<ArrayBuffer>;
     counts: Uint32Array<ArrayBuffer>;
     /**
-     * @param {Float32Array} positions those of the splats (3 N)
+     * @param {Float32Array} positions those of the splats (3 N); those with NaN are omitted
      * @param {number} width orders fill whole rows of a texture that is `width` texels wide
-     * @param {number[]} [units] of each row's near plane
+     * @param {number[]} [units] for each row, a factor of the depth of the near plane; 1 by default
      */
     constructor(positions: Float32Array, width: number, units?: number[]);
     /**
@@ -20,7 +21,7 @@ export declare class DepthSort {
      * the planes `sides` are omitted. At equal depth the splat with the larger index comes first, as in the rasteriser.
      * @param {number[]} row the third row of the camera's pose
      * @param {number[]} sides from `frustumPlanes`
-     * @param {number} near the depth of the near plane
+     * @param {number} near the depth of the near plane, before the factors `units`
      * @param {Uint32Array | null} [order] an array to reuse, if its length fits
      * @param {Uint8Array | null} [kept] 0 for each splat to omit
      * @returns {{order: Uint32Array, drawn: number}} indices of splats, of which the first `drawn` are valid

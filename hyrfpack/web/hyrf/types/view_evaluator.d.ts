@@ -52,6 +52,7 @@ export type SkySize = {
  * @returns {SkySize | null}
  */
 export declare function skySize(metadata: import("./metadata.js").Metadata): SkySize | null;
+/** A model, and which of its rows and of the tiles of its background were evaluated from which viewpoint. */
 export declare class ViewEvaluator {
     model: import("./reader.js").Model;
     rows: RowStates;

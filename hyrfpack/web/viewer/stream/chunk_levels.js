@@ -49,6 +49,7 @@ export class ChunkLevels {
     return this.levels.reduce((sum, { rows, file }) => sum + (rows.length ? file.gaussians : 0), 0);
   }
 
+  // Returns whether a level can be drawn.
   isReady(level) {
     return this.get(level)?.state === READY;
   }

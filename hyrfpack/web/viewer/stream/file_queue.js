@@ -4,12 +4,12 @@
 import { crc32 } from "../../hyrf/crc.js";
 import { groupedDigits } from "../../hyrf/errors.js";
 
-const MAX_REQUESTS = 6; // that browsers send to a server at the same time by HTTP/1.1
+const MAX_REQUESTS = 6; // browsers send no more to a server at the same time by HTTP/1.1
 const FIRST_RETRY_MS = 500, MAX_RETRY_MS = 8000;
 const STALL_MS = 15000; // a request that brings nothing for this time counts as lost
-const MAX_ATTEMPTS = 4; // for a file that is refused for now, ends early or comes damaged
-const MAX_BREAKS = 20; // of the connection within a file
-const MAX_PARTIALS = 32; // beginnings of files that are no longer wanted, in case they are again
+const MAX_FILE_ATTEMPTS = 4; // if it is refused for now, ends early or comes damaged
+const MAX_FILE_BREAKS = 20; // after so many broken connections a file counts as unusable
+const MAX_KEPT_PARTIALS = 32; // beginnings of files that are not needed now, but may be needed again
 const TEMPORARY_STATUSES = [408, 425, 429, 500, 502, 503, 504];
 
 // A file cannot be used. The message says why, as the end of a sentence.
@@ -48,7 +48,7 @@ export class FileQueue {
       aborter.abort();
     }
     const oldPartials = [...this.partials.keys()].filter((name) => !names.has(name)); // the oldest ones first
-    for (const name of oldPartials.slice(0, -MAX_PARTIALS)) this.partials.delete(name);
+    for (const name of oldPartials.slice(0, -MAX_KEPT_PARTIALS)) this.partials.delete(name);
     this.start();
   }
 
@@ -133,7 +133,9 @@ export class FileQueue {
       if (partial.isEncoded) forget(partial); // a range would be one of the compressed bytes
       const isCancelled = this.requests.get(name) !== aborter;
       const isBroken = !(isCancelled || error instanceof UnusableFileError || error instanceof RetryError);
-      if (isBroken && partial.length && ++partial.breaks > MAX_BREAKS) refuse("its connection breaks again and again");
+      if (isBroken && partial.length && ++partial.breaks > MAX_FILE_BREAKS) {
+        refuse("its connection breaks again and again");
+      }
       throw error;
     } finally {
       clearTimeout(stallTimer);
@@ -162,16 +164,18 @@ export class FileQueue {
   }
 }
 
+// Throws the error for a file that cannot be used.
 const refuse = (reason) => {
   throw new UnusableFileError(reason);
 };
 
 // Throws an error for a file that could not be used, the last time for good.
 const refuseAfterAttempts = (partial, reason) => {
-  if (++partial.attempts >= MAX_ATTEMPTS) refuse(reason);
+  if (++partial.attempts >= MAX_FILE_ATTEMPTS) refuse(reason);
   throw new RetryError(reason);
 };
 
+// Drops what was received of a file.
 const forget = (partial) => Object.assign(partial, { parts: [], length: 0 });
 
 // Throws an error unless an answer has the bytes after those of `partial`, or all bytes. With all bytes, those of
@@ -199,6 +203,7 @@ async function readAll(stream, receive) {
   }
 }
 
+// Returns what was received of a file as one array.
 function joinParts({ parts, length }) {
   const data = new Uint8Array(length);
   let at = 0;

@@ -6,7 +6,7 @@ import { chooseLevels, predictErrors } from "../../hyrf/levels.js";
 import { dot, sub } from "../../hyrf/vectors.js";
 import { UNUSABLE } from "./chunk_levels.js";
 
-const KEPT_RATIO = 1 / 4; // of the budget, for the coarsest levels of the nearest chunks
+const KEPT_BUDGET_RATIO = 1 / 4; // for the coarsest levels of the nearest chunks
 
 // Sets the `target` of each of `chunks`, -1 for those that are left out, and whether its coarsest level `isKept`: of
 // all chunks if memory holds the whole scene (`isWhole`). `rows` is the most rows of the chosen levels, or Infinity.
@@ -15,7 +15,7 @@ export function chooseTargets(manifest, chunks, camera, { gaussians, rows, isWho
   const errors = predictErrors(manifest, camera);
   const costOf = ({ file, rowCount }) => Math.max(file.gaussians, (rowCount / rows) * gaussians);
   const costs = chunks.map(({ levels }) => [...levels.map(costOf), 0]);
-  const limit = isWhole ? Infinity : KEPT_RATIO * gaussians;
+  const limit = isWhole ? Infinity : KEPT_BUDGET_RATIO * gaussians;
   keepNearest(chunks, manifest.chunks.map((chunk) => angularSize(chunk, camera)), costs, limit);
   const isAvailable = (number, level) => {
     const { levels, coarsest, isKept } = chunks[number];

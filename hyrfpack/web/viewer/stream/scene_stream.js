@@ -42,19 +42,21 @@ import { RowPool } from "./row_pool.js";
 import { ScenePart } from "./scene_part.js";
 
 const ROW_WIDTH = 256; // of the textures: each level begins a row, and the coarsest ones are small
-const FIRST_PICTURE_BYTES = 200_000; // that are fetched before the first picture is drawn, if they have a chunk
-const MEMORY_RATIO = 1.25; // memory for Gaussians in budgets, because levels that fade are there twice
+const FIRST_PICTURE_BYTES = 200_000; // the first picture waits for so many bytes of files, and for one chunk at least
+const MEMORY_PER_BUDGET_RATIO = 1.25; // Gaussians in memory, above 1 because levels that fade are there twice
 // Rows beyond that memory: for each of so many chunks, one for its coarsest level and one for rows that are not full.
 const EXTRA_ROWS_PER_CHUNK = 2, MAX_EXTRA_CHUNKS = 256;
-// That wait to be evaluated. A slow device then evaluates what the present view needs, not all that earlier ones did.
+// More rows do not wait to be evaluated, so that a slow device evaluates what the present view needs, and not all that
+// earlier views needed.
 const MAX_UPLOADING_ROWS = 512;
 // Bytes of the tables of further parts that are in memory, for each Gaussian of the budget, which itself takes about as
 // many bytes. Two parts of any size are always allowed: one loads while levels of the other are evaluated.
 const FIELD_BYTES_PER_GAUSSIAN = 128, MIN_FURTHER_PARTS = 2;
-const MAX_FIRST_LOSSES = 3; // of the connection before the first picture; then what is there is drawn
+const MAX_EARLY_LOSSES = 3; // after so many losses of the connection, the first picture is drawn of what is there
 const MAX_PSNR_DB = 99;
-const MIN_UPDATE_MS = 20; // between two updates, so that many events cause only one
+const MIN_UPDATE_INTERVAL_MS = 20; // between two updates, so that many events cause only one
 
+// Returns the number of rows that Gaussians take, at least one.
 const countRows = (gaussians) => Math.max(1, Math.ceil(gaussians / ROW_WIDTH));
 
 export class SceneStream {
@@ -107,11 +109,11 @@ export class SceneStream {
   // Sets the number of rows of the textures, and what a view may have of Gaussians and of rows.
   reserveRows(maxRows) {
     const { chunks, gaussians } = this, extraChunks = Math.min(chunks.length, MAX_EXTRA_CHUNKS);
-    const all = chunks.reduce((sum, { levels }) => levels.reduce((rows, { rowCount }) => rows + rowCount, sum), 0);
+    const allRows = chunks.reduce((sum, { levels }) => levels.reduce((rows, { rowCount }) => rows + rowCount, sum), 0);
     const extra = EXTRA_ROWS_PER_CHUNK * extraChunks;
-    this.rowCount = Math.max(1, Math.min(all, maxRows, countRows(MEMORY_RATIO * gaussians) + extra));
-    this.isWhole = all <= this.rowCount; // whether the whole scene has room
-    const budgetRows = (this.rowCount - extra) / MEMORY_RATIO;
+    this.rowCount = Math.max(1, Math.min(allRows, maxRows, countRows(MEMORY_PER_BUDGET_RATIO * gaussians) + extra));
+    this.isWhole = allRows <= this.rowCount; // whether the whole scene has room
+    const budgetRows = (this.rowCount - extra) / MEMORY_PER_BUDGET_RATIO;
     // A device with small textures has a smaller budget.
     this.maxGaussians = this.isWhole ? Infinity : budgetRows * ROW_WIDTH;
     // Few chunks have no more rows than this.
@@ -130,6 +132,7 @@ export class SceneStream {
     for (const part of this.parts) part.sent = null;
   }
 
+  // Handles a message of the page.
   handle({ look, gaussians, uploaded, faded, unusable, again, close }) {
     if (close) return this.close();
     if (look) this.view = { ticket: look.ticket, camera: cameraOf(look.view, this.scene) };
@@ -142,6 +145,7 @@ export class SceneStream {
     if (look || gaussians || uploaded || faded || again) this.schedule();
   }
 
+  // Ends all requests and updates.
   close() {
     this.isClosed = true;
     this.queue?.close();
@@ -152,7 +156,7 @@ export class SceneStream {
   // Updates soon. Choosing levels of many chunks takes long, so it leaves time for sorting.
   schedule() {
     if (this.isClosed) return;
-    this.timer ??= setTimeout(() => this.update(), Math.max(MIN_UPDATE_MS, 2 * this.updateMs));
+    this.timer ??= setTimeout(() => this.update(), Math.max(MIN_UPDATE_INTERVAL_MS, 2 * this.updateMs));
   }
 
   // Chooses levels, and does what is to be done next.
@@ -191,6 +195,7 @@ export class SceneStream {
     this.post({ swap: { number: this.number, chunk: number, from, to, mse } });
   }
 
+  // Records that the fade of a chunk has ended, and hides the level from which it began.
   endFade(chunk) {
     const { from } = chunk.fading ?? { from: -1 };
     if (from >= 0) this.setPositions(chunk.get(from), null);
@@ -232,7 +237,7 @@ export class SceneStream {
     this.want(missing);
     const read = first.length - missing.length;
     this.post({ progress: { what: "loading", part: read / Math.max(1, first.length) } });
-    const hasLost = this.queue.losses > MAX_FIRST_LOSSES;
+    const hasLost = this.queue.losses > MAX_EARLY_LOSSES;
     if (scene.isRead && (!missing.length || (hasLost && read))) this.postContent();
     else if (hasLost) this.fail(`${new URL(this.queue.folder).host} does not answer; reload the page to try again`);
   }
@@ -411,6 +416,7 @@ export class SceneStream {
     for (const [file, data] of early) this.receive(file, data);
   }
 
+  // Takes the file of a level, and sends its Gaussians or keeps them for the content.
   async receiveChunk(file, bytes) {
     const [number, levelNumber] = this.places.get(file.file), chunk = this.chunks[number], part = this.partOf(chunk);
     if (!part.isRead) {
@@ -532,6 +538,8 @@ function coarsestUsable(chunk) {
 // Returns the message of an error as the end of a sentence.
 const reasonOf = ({ message }) => message[0].toLowerCase() + message.slice(1).replace(/\.$/, "");
 
+// Returns the buffers of the arrays of a level.
 const listBuffers = (chunk) => Object.values(chunk).filter(ArrayBuffer.isView).map(({ buffer }) => buffer);
 
+// Returns the buffers of the tables of a packed model.
 const listTables = ({ geometry, radiance }) => [geometry.table.buffer, radiance.table.buffer];

@@ -12,16 +12,17 @@ import { StreamedFields } from "./streamed_fields.js";
 
 export const DEFAULT_GAUSSIANS = 2_000_000;
 export const DEFAULT_PHONE_GAUSSIANS = 500_000;
-const MIN_GAUSSIANS = 100_000; // that slow frames leave
+const MIN_ADAPTED_GAUSSIANS = 100_000; // slow frames lower the budget no further
 const PHONE_QUERY = "(pointer: coarse) and (max-width: 600px), (pointer: coarse) and (max-height: 600px)";
 const MANIFEST_NAME = "scene.json";
 const MAX_MANIFEST_BYTES = 2 ** 24;
-const MOVING_LOOK_MS = 150; // between two choices of levels while the view moves
-const DETAILS = [[40, "full"], [34, "high"], [28, "medium"], [0, "low"]]; // predicted PSNR in dB, and a word for it
-const ADAPTATION_MS = 1000; // between two changes of the budget
+const MIN_LOOK_INTERVAL_MS = 150; // between two choices of levels while the view moves
+// The least predicted PSNR in dB that each word describes.
+const DETAIL_WORDS_BY_PSNR_DB = [[40, "full"], [34, "high"], [28, "medium"], [0, "low"]];
+const MIN_ADAPTATION_INTERVAL_MS = 1000; // between two changes of the budget
 // The budget falls where frames are slow at this part of the resolution, and rises where they are quick at full one.
 const LOW_RESOLUTION_RATIO = 0.5, SLOW_FRAME_MS = 43, QUICK_FRAME_MS = 20;
-const FEWER_RATIO = 0.8, MORE_RATIO = 1.25;
+const BUDGET_DECREASE_RATIO = 0.8, BUDGET_INCREASE_RATIO = 1.25;
 
 // Returns whether an address is that of a scene's manifest.
 const isManifest = (address) => new URL(address).pathname.endsWith(".json");
@@ -65,6 +66,7 @@ class StreamLoader extends Loader {
     return new Uint8Array(await new Blob(parts).arrayBuffer());
   }
 
+  // Sends a message to the worker.
   post(message) {
     this.connection.post(message);
   }
@@ -97,6 +99,7 @@ class StreamLoader extends Loader {
     this.redraw();
   }
 
+  // Handles what the worker says about the scene.
   setState(state) {
     if (this.player.loader !== this) return; // meanwhile another scene is shown
     const before = this.state;
@@ -135,7 +138,7 @@ class StreamLoader extends Loader {
   look(view, isMoving) {
     const { lastLook } = this, { rows, eye, width, height, fx, fy, cx, cy } = view, now = performance.now();
     const key = [rows, eye, width, height, fx, fy, cx, cy].join();
-    if (key === lastLook.key || (isMoving && now < lastLook.at + MOVING_LOOK_MS)) return lastLook.ticket;
+    if (key === lastLook.key || (isMoving && now < lastLook.at + MIN_LOOK_INTERVAL_MS)) return lastLook.ticket;
     this.lastLook = { key, ticket: lastLook.ticket + 1, at: now };
     this.post({ look: { ticket: this.lastLook.ticket, view } });
     return this.lastLook.ticket;
@@ -155,10 +158,11 @@ class StreamLoader extends Loader {
   // Adapts the budget to the ms that a frame of a moving view takes.
   adapt(ms) {
     const { player: { automatic, coarse, scene }, most } = this, now = performance.now();
-    if (!automatic || !this.fields || now < this.adaptedAt + ADAPTATION_MS) return;
+    if (!automatic || !this.fields || now < this.adaptedAt + MIN_ADAPTATION_INTERVAL_MS) return;
     const isSlow = coarse <= LOW_RESOLUTION_RATIO && ms > SLOW_FRAME_MS, isQuick = coarse === 1 && ms < QUICK_FRAME_MS;
-    const ratio = isSlow ? FEWER_RATIO : isQuick ? MORE_RATIO : 1, present = Math.min(this.gaussians, scene.count);
-    const gaussians = Math.min(most, Math.max(Math.min(MIN_GAUSSIANS, most), Math.round(ratio * present)));
+    const ratio = isSlow ? BUDGET_DECREASE_RATIO : isQuick ? BUDGET_INCREASE_RATIO : 1;
+    const present = Math.min(this.gaussians, scene.count);
+    const gaussians = Math.min(most, Math.max(Math.min(MIN_ADAPTED_GAUSSIANS, most), Math.round(ratio * present)));
     if (ratio === 1 || gaussians === this.gaussians) return;
     Object.assign(this, { gaussians, adaptedAt: now });
     this.post({ gaussians });
@@ -177,7 +181,7 @@ export const STREAMING = { StreamLoader, isManifest, describeLoaded };
 // its detail.
 function describeLoaded({ gaussians, bytes, totalBytes, psnr }, count) {
   const megabytes = [bytes, totalBytes].map((size) => (size / 1e6).toFixed(1));
-  const [, detail] = DETAILS.find(([least]) => psnr >= least);
+  const [, detail] = DETAIL_WORDS_BY_PSNR_DB.find(([minPsnr]) => psnr >= minPsnr);
   const drawn = `${gaussians.toLocaleString("en")} of ${count.toLocaleString("en")} Gaussians`;
   return [drawn, `${megabytes.join(" of ")} MB loaded, ${detail} detail here`];
 }

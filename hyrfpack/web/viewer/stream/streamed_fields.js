@@ -9,9 +9,10 @@ import { PartFields } from "./part_fields.js";
 import { eachRun } from "./row_pool.js";
 
 const FADE_MS = 400;
-// Of a frame: slow devices show fades in several steps, too, and never stop within a fade.
+// Limits of the part of a fade that one frame adds. Slow devices, too, show fades in several steps, and never stop
+// within a fade.
 const MAX_FADE_STEP = 1 / 3, MIN_FADE_STEP = 1 / 20;
-const MAX_FRAME_RMS = 10 ** (-30 / 20); // between two frames of fades, which is a PSNR of 30 dB
+const MAX_FADE_STEP_RMS = 10 ** (-30 / 20); // the change between two frames of fades: a PSNR of 30 dB
 // A picture changes by up to 1.7 times as much in a step as in equal steps, and by up to twice as much as predicted.
 const FADE_RMS_RATIO = 1.7 * 2;
 const MAX_FRAME_WAIT_MS = 5000; // where no frames are drawn for this time, as in a hidden page, fades end at once
@@ -158,8 +159,8 @@ export class StreamedFields extends Fields {
       gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
       for (let start = 0, k = 0; start < numbers.length; start += layer, k++) {
         eachRun(rows, (first, count, place) => {
-          const some = numbers.subarray(start + 4 * width * place, start + 4 * width * (place + count));
-          gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, first, k, width, count, 1, gl.RGBA, gl.FLOAT, some);
+          const piece = numbers.subarray(start + 4 * width * place, start + 4 * width * (place + count));
+          gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, first, k, width, count, 1, gl.RGBA, gl.FLOAT, piece);
         });
       }
     }
@@ -289,11 +290,11 @@ export class StreamedFields extends Fields {
   }
 }
 
-// Returns the largest step of fades that changes the picture by no more than MAX_FRAME_RMS, as far as their predicted
-// errors say.
+// Returns the largest step of fades that changes the picture by no more than MAX_FADE_STEP_RMS, by their predicted
+// errors.
 function largestFadeStep(fades) {
   const rms = Math.sqrt(fades.reduce((sum, { mse }) => sum + mse, 0));
-  return Math.min(MAX_FADE_STEP, Math.max(MIN_FADE_STEP, MAX_FRAME_RMS / (FADE_RMS_RATIO * rms)));
+  return Math.min(MAX_FADE_STEP, Math.max(MIN_FADE_STEP, MAX_FADE_STEP_RMS / (FADE_RMS_RATIO * rms)));
 }
 
 // Returns the weight of the new level at a part of a fade. It rises slowly at both ends, where a small weight of opaque
