@@ -114,6 +114,7 @@ export class Loader {
         this.connection.post({ bytes: own }, [own.buffer]);
       }
     } catch (error) {
+      source.return?.().catch(() => {}); // not awaited, because its next bytes may never come
       this.connection.post({ broken: true });
       this.fail(error);
       throw error;
