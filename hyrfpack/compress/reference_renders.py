@@ -27,6 +27,8 @@ MAX_COMPARISON_VIEWS = 10
 # If the errors in two views are both higher, or both lower, than their prediction by more than this factor, the others
 # are not measured: the prediction is then corrected by far more than the errors of views differ.
 MAX_ROUGH_ERROR_RATIO = 6.0
+# Larger changes of a colour logit are limited to this, because their exponentials would overflow float32.
+MAX_LOGIT_CHANGE = 80.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class ReferenceRenders:
         The colours must be sigmoids of logits, as those of a model without colour residuals. A change d of the logit
         of a colour c multiplies its odds c / (1 - c) by r = exp(d), so the new colour is r c / (1 + (r - 1) c).
         """
-        ratio = change.exp()
+        ratio = change.clamp(-MAX_LOGIT_CHANGE, MAX_LOGIT_CHANGE).exp()
         device = change.device
         return parallel_map(lambda colors: ratio * colors / (1 + (ratio - 1) * colors), self.colors, device)
 

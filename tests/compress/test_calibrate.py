@@ -243,6 +243,13 @@ def test_colours_after_a_change_of_logits_equal_those_of_the_changed_model(model
         torch.testing.assert_close(ours, colors_in_view(changed, view, changed.decode()), rtol=0, atol=1e-5)
 
 
+def test_colors_after_a_huge_change_of_their_logits_are_finite(model):
+    references = ReferenceRenders.from_model(model, CALIBRATION_CAMERAS)
+    for change in (-1e6, 1e6):
+        for colors in references.shift_color_logits(torch.full((len(model), 3), change)):
+            assert torch.isfinite(colors).all() and 0 <= colors.min() and colors.max() <= 1
+
+
 def test_a_plan_is_made_again_only_if_it_would_differ(model, first_order):
     planner = Planner(model)
     planned = planner.plan(first_order, 1e-4)
