@@ -192,8 +192,8 @@ class _CompiledChoices(_Choices):
     """The same choices by Numba."""
 
     def take_nearest(self, weight: int) -> tuple[np.ndarray, np.ndarray]:
-        none = np.zeros(0)
-        return self._lift(weight, 0, 0.0, none, none, none, none[None], 0)
+        unused = np.zeros(0)  # Without a reach, no cost is computed.
+        return self._lift(weight, 0, 0.0, unused, unused, unused, unused[None], 0)
 
     def take_cheapest(self, weight: int, cost: _Cost, reach: int) -> tuple[np.ndarray, np.ndarray]:
         return self._lift(weight, reach, cost.mean, *self._cost_arrays(cost))

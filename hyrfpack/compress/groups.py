@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from hyrfpack.compress.rate_distortion import (
@@ -49,19 +51,20 @@ def quantize_groups(
     if reach:
         contexts = groups.gather(models)
         bits = estimate_code_bits(symbols, contexts, ENTROPY_MODEL_COUNT, reach)
-        choose = _choose_compiled if uses_numba(implementation) else _choose
-        choose(
-            values,
-            groups,
-            steps,
-            sensitivity,
-            _MIN_RELATIVE_SENSITIVITY * mean,
-            contexts,
-            bits,
-            distortion,
-            reach,
-            symbols,
-        )
+        min_sensitivity = _MIN_RELATIVE_SENSITIVITY * mean
+        if uses_numba(implementation):
+            from hyrfpack.compress import quantization_kernels
+
+            table, lowest = bits
+            rates = LAMBDA_PER_DISTORTION * distortion * table
+            quantization_kernels.choose_group_symbols(
+                values, index, steps, min_sensitivity, sensitivity, contexts, rates, lowest, reach, symbols
+            )
+        else:
+            for part in iter_blocks(len(values)):
+                weights = np.maximum(sensitivity[part], min_sensitivity[index[part]])
+                error = partial(_squared_errors, weights, steps[index[part]], values[part])
+                symbols[part] = choose_symbols(symbols[part], error, contexts[part], bits, distortion, reach)
         for part in iter_blocks(len(values)):
             chosen = np.clip(symbols[part], -MAX_ABS_SYMBOL, MAX_ABS_SYMBOL)
             symbols[part] = np.where(unread[index[part]], 0, chosen)
@@ -69,49 +72,9 @@ def quantize_groups(
     return GroupSymbols(codes, models, symbols, (symbols * groups.gather(steps)).astype(np.float32))
 
 
-def _choose(
-    values: np.ndarray,
-    groups: StepGroups,
-    steps: np.ndarray,
-    sensitivity: np.ndarray,
-    min_sensitivity: np.ndarray,
-    contexts: np.ndarray,
-    bits: tuple[np.ndarray, int],
-    distortion: float,
-    reach: int,
-    symbols: np.ndarray,
-) -> None:
-    """Replace the nearest symbols (n,) by those of the lowest cost within `reach`."""
-    for part in iter_blocks(len(values)):
-        weights = np.maximum(sensitivity[part], min_sensitivity[groups.index[part]])
-        step = steps[groups.index[part]]
-
-        def error(candidates: np.ndarray, weights=weights, step=step, wanted=values[part]) -> np.ndarray:
-            return weights * (candidates * step - wanted) ** 2
-
-        symbols[part] = choose_symbols(symbols[part], error, contexts[part], bits, distortion, reach)
-
-
-def _choose_compiled(
-    values: np.ndarray,
-    groups: StepGroups,
-    steps: np.ndarray,
-    sensitivity: np.ndarray,
-    min_sensitivity: np.ndarray,
-    contexts: np.ndarray,
-    bits: tuple[np.ndarray, int],
-    distortion: float,
-    reach: int,
-    symbols: np.ndarray,
-) -> None:
-    """Do what `_choose` does, by Numba."""
-    from hyrfpack.compress import quantization_kernels
-
-    table, lowest = bits
-    rates = LAMBDA_PER_DISTORTION * distortion * table
-    quantization_kernels.choose_group_symbols(
-        values, groups.index, steps, min_sensitivity, sensitivity, contexts, rates, lowest, reach, symbols
-    )
+def _squared_errors(weights: np.ndarray, steps: np.ndarray, values: np.ndarray, symbols: np.ndarray) -> np.ndarray:
+    """Return the weighted squared error (n,) of candidate symbols (n,) for values (n,)."""
+    return weights * (symbols * steps - values) ** 2
 
 
 def choose_group_codes(groups: StepGroups, sensitivity: np.ndarray, distortion: float) -> tuple[np.ndarray, np.ndarray]:
