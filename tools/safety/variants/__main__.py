@@ -1,11 +1,17 @@
-"""Read about a hundred variants of a data set, as users may have them, and check the result of each.
+"""Read up to 150 variants of each data set, as users may have them, and check the result of each.
 
     python -m tools.safety.variants SET [SET ...] [--only WORD]
 
-Each variant is built in a temporary folder from links to the set's files, and read. The program prints one line for
-each: "read" with the notes, if cameras and pictures equal those of the set; "refused" with the error message; or
-"WRONG" if pictures or cameras differ, if the variant should be refused but is read or vice versa, or if reading raises
-anything but a HyrfError. It exits with 1 if a variant is WRONG.
+Each variant is built in a temporary folder from links to the set's files, and read. A set is read in each layout that
+it has. The program prints one line for each variant:
+
+    read        cameras and pictures equal those of the set; the line shows the notes
+    refused     the set cannot be read in this form, and the error message says why
+    WRONG       cameras or pictures differ, a variant is read that should be refused or vice versa, a note is missing,
+                or reading raises anything but a HyrfError
+    skipped     a package is missing that the change needs
+
+It exits with 1 if a variant is WRONG, and with 2 if none was checked.
 """
 
 from __future__ import annotations
@@ -53,7 +59,7 @@ def main() -> int:
                         counts[outcome.kind] += 1
                         print(f"  {outcome.kind:8}{variant.name:58}{outcome.message[:200]}", flush=True)
                 shutil.rmtree(original_set.root)
-    if not counts:
+    if counts.total() == counts["skipped"]:
         fix = "name folders of data sets, and a word of a variant's name with `only`"
         raise HyrfError(f"nothing was checked: {', '.join(map(str, options.sets))} --only '{options.only}'", fix=fix)
     print("\n" + ", ".join(f"{kind}: {count}" for kind, count in sorted(counts.items())))

@@ -12,7 +12,7 @@ from tools.safety.variants.variant import ALL_LAYOUTS, Variant
 from tools.safety.variants.working_set import WorkingSet
 
 
-def variants() -> Iterator[Variant]:
+def list_variants() -> Iterator[Variant]:
     """Yield the variants of this module."""
     note = "was unpacked"
     yield Variant("zip: flat", _zip_set, layouts=ALL_LAYOUTS, note=note)
@@ -40,13 +40,13 @@ def variants() -> Iterator[Variant]:
 
 def _zip_set(s: WorkingSet, top: str = "", *, before: Callable[[zipfile.ZipFile], None] = lambda archive: None) -> Path:
     """Replace the set's folder by one archive; return its path."""
-    s.given = s.root.with_suffix(".zip")
-    with zipfile.ZipFile(s.given, "w", zipfile.ZIP_DEFLATED) as archive:
+    s.source_path = s.root.with_suffix(".zip")
+    with zipfile.ZipFile(s.source_path, "w", zipfile.ZIP_DEFLATED) as archive:
         before(archive)
         for file in sorted(path for path in s.root.rglob("*") if path.is_file()):
             archive.write(file, top + file.relative_to(s.root).as_posix())
     shutil.rmtree(s.root)
-    return s.given
+    return s.source_path
 
 
 def _add_mac_files(archive: zipfile.ZipFile) -> None:

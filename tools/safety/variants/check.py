@@ -20,8 +20,8 @@ class Outcome:
     """Result of reading a variant.
 
     Attributes:
-        kind: "read", "refused" or "WRONG".
-        message: the error message, the notes, or what is wrong.
+        kind: "read", "refused", "WRONG", or "skipped" if a package is missing that the change needs.
+        message: the error message, the notes, what is wrong, or the missing package.
     """
 
     kind: str
@@ -40,11 +40,14 @@ def check_variant(variant: Variant, source: Path, layout: str, folder: Path, ori
     """
     try:
         working_set = WorkingSet(source, folder / "set", layout)
-        variant.make(working_set)
         try:
-            scene = load_scene(working_set.given)
-            wrong = find_difference(
-                scene, original_scene, working_set.masked, missing_allowed="missing" in variant.name
+            variant.make(working_set)
+        except ModuleNotFoundError as error:
+            return Outcome("skipped", f"the package {error.name} is not installed")
+        try:
+            scene = load_scene(working_set.source_path)
+            difference = find_difference(
+                scene, original_scene, working_set.masked_share, may_lack_photos=variant.may_lack_photos
             )
         except HyrfError as error:
             message = str(error).replace(str(folder), "")
@@ -53,9 +56,9 @@ def check_variant(variant: Variant, source: Path, layout: str, folder: Path, ori
         message = "; ".join(scene.notes).replace(str(folder), "")
         if variant.expect != EXPECT_READ:
             return Outcome("WRONG", f"read, but should be refused; {message}")
-        if not wrong and variant.note and not re.search(variant.note, message):
-            wrong = f"no note has '{variant.note}'"
-        return Outcome("WRONG" if wrong else "read", f"{wrong}; {message}" if wrong else message)
+        if not difference and variant.note and not re.search(variant.note, message):
+            difference = f"no note has '{variant.note}'"
+        return Outcome("WRONG" if difference else "read", f"{difference}; {message}" if difference else message)
     except Exception as error:  # a variant must raise nothing but a HyrfError
         return Outcome("WRONG", f"{type(error).__name__}: {str(error)[:300]}")
     finally:

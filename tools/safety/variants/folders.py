@@ -11,7 +11,7 @@ from tools.safety.variants.variant import ALL_LAYOUTS, Variant
 from tools.safety.variants.working_set import WorkingSet
 
 
-def variants() -> Iterator[Variant]:
+def list_variants() -> Iterator[Variant]:
     """Yield the variants of this module."""
 
     def move_folders(*moves: tuple[str, str]) -> Callable[[WorkingSet], None]:
@@ -50,13 +50,14 @@ def variants() -> Iterator[Variant]:
         "undistorted/sparse",
         "distorted/sparse/0",
     ):
-        yield Variant(f"folders: model in {folder}", move_folders(("sparse/0", "taken"), ("taken", folder)))
+        yield Variant(f"folders: model in {folder}", move_folders(("sparse/0", "moved model"), ("moved model", folder)))
     yield Variant(
-        "folders: dense/", move_folders(("sparse/0", "taken"), ("taken", "dense/sparse"), ("images", "dense/images"))
+        "folders: dense/",
+        move_folders(("sparse/0", "moved model"), ("moved model", "dense/sparse"), ("images", "dense/images")),
     )
     yield Variant(
         "folders: dense/0/",
-        move_folders(("sparse/0", "taken"), ("taken", "dense/0/sparse"), ("images", "dense/0/images")),
+        move_folders(("sparse/0", "moved model"), ("moved model", "dense/0/sparse"), ("images", "dense/0/images")),
     )
     yield Variant(
         "folders: dense/ beside sparse/ without photos",
@@ -110,7 +111,7 @@ def variants() -> Iterator[Variant]:
         layouts=("colmap", "nerfstudio"),
     )
     yield Variant("folders: poses alone are missing", lambda s: shutil.rmtree(s.root / "sparse"), "no poses found")
-    yield Variant("folders: the model's given", lambda s: setattr(s, "given", s.model), "no photo folder")
+    yield Variant("folders: the model's given", lambda s: setattr(s, "source_path", s.model), "no photo folder")
 
 
 def _nest_set(s: WorkingSet, folder: str) -> None:

@@ -10,7 +10,7 @@ from tools.safety.variants.variant import Variant
 from tools.safety.variants.working_set import WorkingSet
 
 
-def variants() -> Iterator[Variant]:
+def list_variants() -> Iterator[Variant]:
     """Yield the variants of this module."""
     note = "have a mask"
     yield Variant("masks: of the photos' names", lambda s: s.write_masks(lambda f: f"masks/{f.stem}.png"), note=note)
@@ -28,17 +28,17 @@ def variants() -> Iterator[Variant]:
     )
     yield Variant(
         "masks: one of another shape",
-        lambda s: (s.write_masks(lambda f: "masks/camera.png", (50, 13)), setattr(s, "masked", 0.0)),
+        lambda s: (s.write_masks(lambda f: "masks/camera.png", (50, 13)), setattr(s, "masked_share", 0.0)),
         note="aspect ratio",
     )
     yield Variant(
         "masks: of no photo",
-        lambda s: (s.write_masks(lambda f: f"masks/{f.stem}_mask.png"), setattr(s, "masked", 0.0)),
+        lambda s: (s.write_masks(lambda f: f"masks/{f.stem}_mask.png"), setattr(s, "masked_share", 0.0)),
         note="match no photo of the scene",
     )
     yield Variant(
         "masks: in mask/",
-        lambda s: (s.write_masks(lambda f: f"mask/{f.stem}.png"), setattr(s, "masked", 0.0)),
+        lambda s: (s.write_masks(lambda f: f"mask/{f.stem}.png"), setattr(s, "masked_share", 0.0)),
         note="folder mask is not read",
     )
 

@@ -15,7 +15,7 @@ JSON_LAYOUTS = ("nerfstudio", "blender")
 LOOSE_MATCH_NOTE = "have other names"
 
 
-def variants() -> Iterator[Variant]:
+def list_variants() -> Iterator[Variant]:
     """Yield the variants of this module."""
     for ending in (".Jpg", ".JPG", ".jpeg", ".JPEG"):
         yield Variant(
@@ -137,6 +137,7 @@ def variants() -> Iterator[Variant]:
         lambda s: [file.unlink() for file in s.photos[1::3]],
         layouts=ALL_LAYOUTS,
         note="not on disk",
+        may_lack_photos=True,
     )
     yield Variant(
         "names: of other photos",

@@ -10,7 +10,7 @@ from tools.safety.variants.variant import ALL_LAYOUTS, Variant
 from tools.safety.variants.working_set import WorkingSet
 
 
-def variants() -> Iterator[Variant]:
+def list_variants() -> Iterator[Variant]:
     """Yield the variants of this module."""
 
     def store_rotated(

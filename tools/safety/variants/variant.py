@@ -21,6 +21,7 @@ class Variant:
         expect: EXPECT_READ, or a pattern that the error message must match.
         layouts: the layouts that have this variant.
         note: a pattern that the notes must match if the variant is read.
+        may_lack_photos: whether photos of the original set may be missing if the variant is read.
     """
 
     name: str
@@ -28,3 +29,4 @@ class Variant:
     expect: str = EXPECT_READ
     layouts: tuple[str, ...] = ("colmap",)
     note: str = ""
+    may_lack_photos: bool = False

@@ -19,13 +19,13 @@ class WorkingSet:
 
     Attributes:
         root: the folder of the copy.
-        given: the path to read; it is `root` unless a variant changes it.
+        source_path: the path to read; it is `root` unless a variant changes it.
         layout: "colmap", "nerfstudio" or "blender".
-        masked: share of each photo that a mask of the variant removes; None without masks.
+        masked_share: share of each photo that a mask of the variant removes; None without masks.
     """
 
     def __init__(self, source: Path, root: Path, layout: str) -> None:
-        self.root, self.layout, self.given, self.masked = root, layout, root, None
+        self.root, self.layout, self.source_path, self.masked_share = root, layout, root, None
         root.mkdir(parents=True)
         keep = {"colmap": ("images", "sparse"), "nerfstudio": ("images", "transforms.json", "sparse_pc.ply")}
         for file in (path for path in source.rglob("*") if path.is_file()):
@@ -40,9 +40,10 @@ class WorkingSet:
 
     @property
     def model(self) -> Path:
+        """The folder of the COLMAP model."""
         return self.root / "sparse" / "0"
 
-    def reconstruction(self):
+    def read_reconstruction(self):
         """Return the COLMAP model as a pycolmap reconstruction."""
         import pycolmap
 
@@ -63,20 +64,22 @@ class WorkingSet:
     def list_pose_names(self) -> list[str]:
         """Return the names of the photos in the poses."""
         if self.layout == "colmap":
-            return [image.name for image in self.reconstruction().images.values()]
+            return [image.name for image in self.read_reconstruction().images.values()]
         return [
-            str(frame["file_path"]) for file in self._transforms() for frame in json.loads(file.read_text())["frames"]
+            str(frame["file_path"])
+            for file in self._list_transforms_files()
+            for frame in json.loads(file.read_text())["frames"]
         ]
 
     def rename_in_poses(self, change: Callable[[str], str], *, text: bool = False) -> None:
-        """Change the names of the photos in the poses."""
+        """Change the names of the photos in the poses; `text` writes a COLMAP model as text."""
         if self.layout == "colmap":
-            model = self.reconstruction()
+            model = self.read_reconstruction()
             for image in model.images.values():
                 image.name = change(image.name)
             self.write_model(model, text=text)
             return
-        for file in self._transforms():
+        for file in self._list_transforms_files():
             content = json.loads(file.read_text())
             for frame in content["frames"]:
                 frame["file_path"] = change(frame["file_path"])
@@ -84,7 +87,7 @@ class WorkingSet:
 
     def write_model(self, model=None, *, text: bool = False) -> None:
         """Write the COLMAP model as text or binary, without the tables that older versions lack."""
-        model = model or self.reconstruction()
+        model = model or self.read_reconstruction()
         for file in self.model.iterdir():
             file.unlink()
         (model.write_text if text else model.write_binary)(str(self.model))
@@ -92,7 +95,7 @@ class WorkingSet:
             (self.model / f"{table}{'.txt' if text else '.bin'}").unlink(missing_ok=True)
 
     def encode(self, ending: str, **options) -> None:
-        """Re-encode the photo files with another ending."""
+        """Re-encode the photo files with another ending; `options` are those of Pillow's writer."""
         for file in self.photos:
             with Image.open(file) as image:
                 picture = image.convert("RGBA" if "A" in image.getbands() else "RGB")
@@ -107,7 +110,7 @@ class WorkingSet:
 
     def write_masks(self, name: Callable[[PurePosixPath], str], size: tuple[int, int] | None = None) -> None:
         """Write masks that remove the upper quarter; `name` returns a mask's path from its photo's path."""
-        self.masked = 0.25
+        self.masked_share = 0.25
         for file in self.photos:
             with Image.open(file) as image:
                 width, height = size or image.size
@@ -118,5 +121,5 @@ class WorkingSet:
             mask[: height // 4] = 0
             Image.fromarray(mask).save(target)
 
-    def _transforms(self) -> Iterator[Path]:
+    def _list_transforms_files(self) -> Iterator[Path]:
         return (self.root / name for name in TRANSFORMS_FILE_NAMES if (self.root / name).is_file())
