@@ -14,6 +14,7 @@ import hyrfpack
 from hyrfpack.errors import HyrfError
 from hyrfpack.parallel.threads import thread_count
 from hyrfpack.scene import Camera
+from tools.command import run_command
 from tools.scenes import write_set as command
 from tools.scenes.catalog import LAYOUTS, SceneDescription, make_scene
 from tools.scenes.geometry import BOX, CYLINDER_Y, ELLIPSOID, SceneArrays
@@ -177,8 +178,9 @@ def test_existing_files_are_kept_without_overwrite(written_set, capsys):
     before = contents(written_set)
     with pytest.raises(HyrfError, match="this folder holds files"):
         write_set(written_set, "object", photos=PHOTO_COUNT, width=PHOTO_WIDTH)
-    with pytest.raises(SystemExit, match="--overwrite"):
-        command.main(["--out", str(written_set.parent), "--scenes", "object"])
+    with pytest.raises(SystemExit) as exit_info:
+        run_command(lambda: command.main(["--out", str(written_set.parent), "--scenes", "object"]))
+    assert exit_info.value.code == 2 and "--overwrite" in capsys.readouterr().err
     assert contents(written_set) == before
 
 

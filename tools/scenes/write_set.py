@@ -14,7 +14,6 @@ import io
 import os
 import re
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -24,20 +23,21 @@ import numpy as np
 from PIL import Image
 
 from hyrfpack.atomic import make_folder, write_atomic
-from hyrfpack.cli.wording import use_option_names
 from hyrfpack.errors import HyrfError
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.parallel.pool import parallel_map
+from tools.command import run_command
 from tools.scenes.catalog import LAYOUTS, SceneDescription, make_scene
 from tools.scenes.colmap_tables import format_tables
 from tools.scenes.render import render_picture
 from tools.scenes.sparse import Corners, SparsePoints, find_corners, make_sparse_points
 
 DEFAULT_PHOTOS, DEFAULT_WIDTH = 60, 1600
-MIN_PHOTOS, MIN_WIDTH, MAX_WIDTH = 3, 48, 8000
+MIN_PHOTOS, MAX_PHOTOS = 3, 9999  # The names of photos have four digits.
+MIN_WIDTH, MAX_WIDTH = 48, 8000  # pixels
 _JPEG_QUALITY = 92
-_SENSOR_NOISE = 1.3 / 255  # standard deviation in display-referred values
-_OWN_FILES = re.compile(r"images/\d{4}\.jpg|sparse/0/(cameras|images|points3D)\.txt")
+_SENSOR_NOISE_STD = 1.3 / 255  # in display-referred values
+_OWN_FILE_PATTERN = re.compile(r"images/\d{4}\.jpg|sparse/0/(cameras|images|points3D)\.txt")
 
 
 def write_set(
@@ -49,9 +49,7 @@ def write_set(
     seed: int = 0,
     overwrite: bool = False,
 ) -> SparsePoints:
-    """Write one photo set.
-
-    The set is written into a temporary folder beside `folder`, which gets its name when it is complete.
+    """Write one photo set into a folder, which appears or is replaced when the set is complete.
 
     Args:
         folder: folder of the set.
@@ -70,7 +68,7 @@ def write_set(
     """
     if scene_name not in LAYOUTS:
         raise ValueError(f"no scene '{scene_name}'; the scenes are {', '.join(LAYOUTS)}")
-    if not (MIN_PHOTOS <= photos < 10_000 and MIN_WIDTH <= width <= MAX_WIDTH and seed >= 0):
+    if not (MIN_PHOTOS <= photos <= MAX_PHOTOS and MIN_WIDTH <= width <= MAX_WIDTH and seed >= 0):
         raise ValueError(f"{photos} photos of {width} pixels with the seed {seed} are out of range")
     check_replaceable(folder, overwrite)
     make_folder(folder.parent)
@@ -118,7 +116,7 @@ def check_replaceable(folder: Path, overwrite: bool) -> None:
         raise HyrfError(
             f"{folder}: this folder holds files", fix="choose another folder, or replace it with `overwrite=True`"
         )
-    foreign = next((file for file in sorted(files) if not _OWN_FILES.fullmatch(file)), None)
+    foreign = next((file for file in sorted(files) if not _OWN_FILE_PATTERN.fullmatch(file)), None)
     if foreign is not None:
         raise HyrfError(f"{folder}: '{foreign}' in it is not part of a generated set", fix="choose another folder")
 
@@ -129,7 +127,7 @@ def _write_files(folder: Path, scene: SceneDescription, seed: int) -> SparsePoin
     def write_photo(number: int) -> Corners:
         picture = render_picture(scene.arrays, scene.cameras[number], scene.exposure)
         noise = np.random.default_rng([seed, 1, number]).standard_normal(picture.shape, np.float32)
-        photo = (np.clip(picture + noise * np.float32(_SENSOR_NOISE), 0, 1) * 255 + 0.5).astype(np.uint8)
+        photo = (np.clip(picture + noise * np.float32(_SENSOR_NOISE_STD), 0, 1) * 255 + 0.5).astype(np.uint8)
         encoded = io.BytesIO()
         Image.fromarray(photo).save(encoded, "JPEG", quality=_JPEG_QUALITY)
         write_atomic(folder / "images" / names[number], encoded.getvalue())
@@ -155,8 +153,8 @@ def _parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, help="random seed (%(default)s)")
     parser.add_argument("--overwrite", action="store_true", help="replace sets that an earlier call wrote")
     args = parser.parse_args(arguments)
-    if not MIN_PHOTOS <= args.photos < 10_000:
-        parser.error(f"--photos {args.photos}: give {MIN_PHOTOS} to 9999 photos")
+    if not MIN_PHOTOS <= args.photos <= MAX_PHOTOS:
+        parser.error(f"--photos {args.photos}: give {MIN_PHOTOS} to {MAX_PHOTOS} photos")
     if not MIN_WIDTH <= args.width <= MAX_WIDTH:
         parser.error(f"--width {args.width}: give {MIN_WIDTH} to {MAX_WIDTH} pixels")
     if args.seed < 0:
@@ -167,26 +165,21 @@ def _parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> None:
     args = _parse_arguments(arguments)
     scenes = list(dict.fromkeys(args.scenes))
-    try:
-        for name in scenes:
-            check_replaceable(args.out / name, args.overwrite)
-        for name in scenes:
-            start = time.perf_counter()
-            folder = args.out / name
-            points = write_set(
-                folder, name, photos=args.photos, width=args.width, seed=args.seed, overwrite=args.overwrite
-            )
-            track_length = len(points.point) / max(len(points.positions), 1)
-            megabytes = sum(file.stat().st_size for file in folder.glob("images/*.jpg")) / 1e6
-            print(
-                f"{folder}: {args.photos} photos of {args.width} x {args.width * 2 // 3} pixels, {megabytes:.1f} MB; "
-                f"{len(points.positions):,} points, mean track length {track_length:.1f}; "
-                f"{time.perf_counter() - start:.0f} s",
-                flush=True,
-            )
-    except HyrfError as error:
-        sys.exit(f"error: {error.problem}; {use_option_names(error.fix)}")
+    for name in scenes:
+        check_replaceable(args.out / name, args.overwrite)
+    for name in scenes:
+        start = time.perf_counter()
+        folder = args.out / name
+        points = write_set(folder, name, photos=args.photos, width=args.width, seed=args.seed, overwrite=args.overwrite)
+        track_length = len(points.point) / max(len(points.positions), 1)
+        megabytes = sum(file.stat().st_size for file in folder.glob("images/*.jpg")) / 1e6
+        print(
+            f"{folder}: {args.photos} photos of {args.width} x {args.width * 2 // 3} pixels, {megabytes:.1f} MB; "
+            f"{len(points.positions):,} points, mean track length {track_length:.1f}; "
+            f"{time.perf_counter() - start:.0f} s",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)
