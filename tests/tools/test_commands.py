@@ -12,6 +12,7 @@ import pytest
 
 from hyrfpack.errors import HyrfError
 from tools.command import run_command
+from tools.safety import make_golden
 from tools.safety.variants import __main__ as variants
 from tools.studies import export_table, mesh_scale
 from tools.studies.train_sets import list_sets
@@ -103,3 +104,46 @@ def test_a_tool_without_options_refuses_arguments_before_it_writes(name, monkeyp
     with pytest.raises(SystemExit) as exit_info:
         importlib.import_module(f"tools.{name}").main()
     assert exit_info.value.code == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [
+        ("fuzz", "--count"), ("fuzz", "--jobs"), ("fuzz_browser", "--count"), ("fuzz_browser", "--jobs"),
+        ("kill", "--kills"), ("kill", "--jobs"), ("races", "--rounds"), ("run_docs", "--steps"),
+    ],
+)  # fmt: skip
+def test_a_check_of_nothing_is_refused(name, option, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [name, option, "0"])
+    with pytest.raises(SystemExit) as exit_info:
+        importlib.import_module(f"tools.safety.{name}").main()
+    assert exit_info.value.code == 2 and f"{option}: '0' is not an integer of at least 1" in capsys.readouterr().err
+
+
+def test_a_missing_page_is_refused_before_another_runs(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["run_docs", str(REPOSITORY_ROOT / "README.md"), "missing.md"])
+    monkeypatch.setattr("subprocess.run", None)
+    with pytest.raises(SystemExit) as exit_info:
+        importlib.import_module("tools.safety.run_docs").main()
+    assert exit_info.value.code == 2 and "missing.md: there is no such page" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["fuzz", "fuzz_browser"])
+def test_a_folder_for_results_that_cannot_be_made_is_refused_before_the_run(name, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    module = importlib.import_module(f"tools.safety.{name}")
+    monkeypatch.setattr("multiprocessing.get_context", None)  # which starts the run
+    monkeypatch.setattr("shutil.which", str)
+    monkeypatch.setattr(sys, "argv", [name, "--jobs", "1", "--out", str(tmp_path / "file" / "runs")])
+    with pytest.raises(HyrfError, match="the folder cannot be made"):
+        module.main()
+
+
+def test_a_golden_file_never_stays_without_its_numbers(tmp_path: Path, monkeypatch):
+    def fail(*_: object, **values: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(make_golden.np, "savez_compressed", fail)
+    with pytest.raises(KeyboardInterrupt):
+        make_golden.write_golden_file(tmp_path / "golden.hyrf", b"bytes", {})
+    assert not list(tmp_path.iterdir())

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 
 from tools.safety import fuzz_browser
-from tools.safety.fuzz_browser import Verdict, find_disagreement, read_in_javascript, read_in_python
+from tools.safety.fuzz_browser import (
+    INPUTS_PER_BATCH,
+    Tally,
+    Verdict,
+    compare_in_processes,
+    find_disagreement,
+    read_in_javascript,
+    read_in_python,
+)
 
 ONE_GROUP, TWO_GROUPS = {"POSI": "1"}, {"POSI": "1", "COLO": "2"}
 
@@ -46,3 +56,21 @@ def test_files_after_one_at_which_node_ends_are_read(tmp_path: Path, monkeypatch
     verdicts = read_in_javascript([(bytes([number]), False) for number in (1, 0, 0, 2)])
     assert [verdict.refused for verdict in verdicts] == ["file 1", "", "", "file 2"]
     assert [verdict.failed.startswith("node ended: exit code") for verdict in verdicts] == [False, True, True, False]
+
+
+def count_inputs(numbers: Sequence[int]) -> Tally:
+    tally = Tally()
+    tally.kinds["made up"] += len(numbers)
+    return tally
+
+
+def die(numbers: Sequence[int]) -> Tally:
+    os._exit(9)
+
+
+def test_all_inputs_are_compared_once():
+    assert compare_in_processes(count_inputs, 2 * INPUTS_PER_BATCH + 1, 2).kinds.total() == 2 * INPUTS_PER_BATCH + 1
+
+
+def test_a_run_ends_if_a_process_dies():
+    assert compare_in_processes(die, INPUTS_PER_BATCH + 1, 1).kinds.total() == 0

@@ -44,6 +44,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from hyrfpack.atomic import check_writable, make_folder
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.paths import orbit
 from hyrfpack.cameras.view_sampling import shrink_camera
@@ -58,6 +59,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.model.exposure import MAX_LOG_GAIN
 from hyrfpack.model.merged import MergedModel, parts_of, scene_of
 from hyrfpack.render.renderer import render_view
+from tools.command import positive_integer, run_command
 from tools.cpu_time import children_cpu_seconds
 from tools.safety.fuzz_mutate import load_merged_seed_files, load_seed_files, make_hostile_file
 
@@ -69,9 +71,8 @@ TRACE_EVERY, FILE_CHECK_EVERY, RENDER_EVERY = 100, 100, 20
 MAX_MESSAGE_CHARACTERS = 1000
 INPUTS_PER_BATCH = 1000
 MAX_FAILED_STARTS = 3  # of workers, one after the other, before a thread gives up
-STUCK_WORKER_SECONDS = (
-    300  # compiled code may not react to the CPU time signal, so a silent worker is killed after this
-)
+# Compiled code may not react to the signal of the CPU time, so a worker that is silent for this long is killed.
+STUCK_WORKER_SECONDS = 300
 
 
 class Failure(Exception):
@@ -90,10 +91,10 @@ class Tally:
         kinds: number of inputs by kind.
         decoded: number of decoded inputs by kind.
         refused: number of refused inputs by message pattern.
-        traced, filed, rendered: number of inputs with traced memory, read from a file, and rendered.
+        traced, read_from_file, rendered: number of inputs with traced memory, read from a file, and rendered.
         slowest: most seconds of CPU time, and the number of the input.
         largest: most bytes allocated at once, and the number of the input.
-        closest: largest share of the allowed bytes, and the number of the input.
+        closest_to_limit: largest share of the allowed bytes, and the number of the input.
         failures: description of each failure by the number of its input.
     """
 
@@ -101,23 +102,24 @@ class Tally:
     decoded: Counter = field(default_factory=Counter)
     refused: Counter = field(default_factory=Counter)
     traced: int = 0
-    filed: int = 0
+    read_from_file: int = 0
     rendered: int = 0
     slowest: tuple[float, int] = (0.0, -1)
     largest: tuple[int, int] = (0, -1)
-    closest: tuple[float, int] = (0.0, -1)
+    closest_to_limit: tuple[float, int] = (0.0, -1)
     failures: dict[int, str] = field(default_factory=dict)
 
     def add(self, other: Tally) -> None:
+        """Add the counts and extremes of another tally."""
         for name in ("kinds", "decoded", "refused", "failures"):
             getattr(self, name).update(getattr(other, name))
-        for name in ("traced", "filed", "rendered"):
+        for name in ("traced", "read_from_file", "rendered"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
-        for name in ("slowest", "largest", "closest"):
+        for name in ("slowest", "largest", "closest_to_limit"):
             setattr(self, name, max(getattr(self, name), getattr(other, name)))
 
 
-# --- one input ---
+# --- Check one input ---
 
 
 def compute_max_decoder_bytes(data: bytes) -> int:
@@ -229,9 +231,9 @@ def examine_input(number: int, seed: int, tally: Tally, folder: Path) -> None:
         signal.setitimer(signal.ITIMER_PROF, MAX_CPU_SECONDS)
         start = time.process_time()
         outcome = decode(data)
-        taken = time.process_time() - start
+        seconds = time.process_time() - start
         signal.setitimer(signal.ITIMER_PROF, 0)
-        tally.slowest = max(tally.slowest, (taken, number))
+        tally.slowest = max(tally.slowest, (seconds, number))
         if isinstance(outcome, str):
             tally.refused[generalize_message(outcome)] += 1
         else:
@@ -245,9 +247,10 @@ def examine_input(number: int, seed: int, tally: Tally, folder: Path) -> None:
         if number % TRACE_EVERY == 0:
             peak, share = check_memory(data)
             tally.traced += 1
-            tally.largest, tally.closest = max(tally.largest, (peak, number)), max(tally.closest, (share, number))
+            tally.largest = max(tally.largest, (peak, number))
+            tally.closest_to_limit = max(tally.closest_to_limit, (share, number))
         if number % FILE_CHECK_EVERY == 0:
-            tally.filed += 1
+            tally.read_from_file += 1
             check_file(data, outcome, folder)
     except CpuTimeExceeded:
         tally.failures[number] = f"{kind}: more than {MAX_CPU_SECONDS} s of CPU time\n{traceback.format_exc()}"
@@ -267,7 +270,7 @@ def generalize_message(message: str) -> str:
     return re.sub(r"<[\w#]{4}>", "<....>", message).split(";")[0][:110]
 
 
-# --- many ---
+# --- Run many inputs in worker processes ---
 
 
 def run_worker(pipe: Connection, current: multiprocessing.Value, seed: int) -> None:
@@ -282,10 +285,8 @@ def run_worker(pipe: Connection, current: multiprocessing.Value, seed: int) -> N
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     warnings.simplefilter("error")
     with tempfile.TemporaryDirectory() as folder:
-        for data in (
-            *load_seed_files()[0],
-            *load_merged_seed_files(),
-        ):  # load and compile everything before the memory limit is set
+        # Everything is loaded and compiled before the memory limit is set.
+        for data in (*load_seed_files()[0], *load_merged_seed_files()):
             model = decode(data)
             check_file(data, model, Path(folder))
             check_rendering(model)
@@ -309,6 +310,7 @@ class FuzzRun:
         self.lock = threading.Lock()
 
     def run(self) -> Tally:
+        """Examine all inputs and return the tally."""
         threads = [threading.Thread(target=self._serve, daemon=True) for _ in range(self.jobs)]
         for thread in threads:
             thread.start()
@@ -318,6 +320,7 @@ class FuzzRun:
         return self.tally
 
     def _serve(self) -> None:
+        """Hand batches to one worker after another, until no batch is left or no worker starts."""
         worker, failed_starts = _Worker(self.seed), 0
         while (first := next(self.batches)) < self.count:
             numbers = list(range(first, min(first + INPUTS_PER_BATCH, self.count)))
@@ -352,6 +355,12 @@ class FuzzRun:
 
 
 class _Worker:
+    """A process that runs `run_worker`.
+
+    Attributes:
+        current: the number of the input that it examines, which outlives the process; -1 before the first one.
+    """
+
     def __init__(self, seed: int) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, end = context.Pipe()
@@ -365,11 +374,11 @@ class _Worker:
         self.current.value = -1
         try:
             self.pipe.send(numbers)
-            before = -1
+            previous = -1
             while not self.pipe.poll(STUCK_WORKER_SECONDS):
-                if self.current.value == before:
+                if self.current.value == previous:
                     self.process.kill()
-                before = self.current.value
+                previous = self.current.value
             return self.pipe.recv()
         except (EOFError, OSError):
             self.process.join()
@@ -383,11 +392,11 @@ def report(tally: Tally, resident: int, seconds: float) -> str:
     lines = [
         f"{total:,} inputs in {seconds:.0f} s ({total / seconds:.0f}/s, {total / cores:.0f} per "
         f"second of CPU time), {len(tally.failures)} failures",
-        f"{decoded:,} decoded, {tally.refused.total():,} refused; memory of {tally.traced:,} traced, {tally.filed:,} "
-        f"read from a file, {tally.rendered:,} rendered",
+        f"{decoded:,} decoded, {tally.refused.total():,} refused; memory of {tally.traced:,} traced, "
+        f"{tally.read_from_file:,} read from a file, {tally.rendered:,} rendered",
         f"slowest input: {tally.slowest[0]:.3f} s of CPU time (input {tally.slowest[1]})",
         f"peak of allocated memory: {tally.largest[0] / 1e6:.1f} MB (input {tally.largest[1]}); at most "
-        f"{tally.closest[0]:.0%} of the allowed bytes (input {tally.closest[1]}); "
+        f"{tally.closest_to_limit[0]:.0%} of the allowed bytes (input {tally.closest_to_limit[1]}); "
         f"largest worker {resident / 1e6:.0f} MB",
         "\nkind of input            inputs   decoded",
         *(f"  {kind:<20} {count:>9,} {tally.decoded[kind]:>9,}" for kind, count in tally.kinds.most_common()),
@@ -399,10 +408,13 @@ def report(tally: Tally, resident: int, seconds: float) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=1_000_000, help="number of inputs (1,000,000)")
+    parser.add_argument("--count", type=positive_integer, default=1_000_000, help="number of inputs (1,000,000)")
     parser.add_argument("--seed", type=int, default=0, help="random seed of the inputs (0)")
     parser.add_argument(
-        "--jobs", type=int, default=multiprocessing.cpu_count(), help="number of worker processes (one per core)"
+        "--jobs",
+        type=positive_integer,
+        default=multiprocessing.cpu_count(),
+        help="number of worker processes (one per core)",
     )
     parser.add_argument(
         "--out", type=Path, default=Path("runs/fuzz"), help="folder for the report and failed inputs (runs/fuzz)"
@@ -413,10 +425,11 @@ def main() -> int:
         kind, data = make_hostile_file(options.only, options.seed)
         print(f"{kind}, {len(data)} bytes: {decode(data)!r:.2000}")
         return 0
+    make_folder(options.out)  # before the run, so that no result is lost
+    check_writable(options.out)
     start = time.monotonic()
     fuzz_run = FuzzRun(options.count, options.seed, options.jobs)
     tally = fuzz_run.run()
-    options.out.mkdir(parents=True, exist_ok=True)
     text = report(tally, fuzz_run.resident, time.monotonic() - start)
     (options.out / f"report-{options.seed}.txt").write_text(text + "\n")
     print("\n" + text)
@@ -433,4 +446,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -7,12 +7,14 @@ as whole files. Both readers must accept an input, or both must refuse it. Accep
 refusal must be one printable line. The reader in JavaScript may take MIN_LIMIT_SECONDS of CPU time plus
 MAX_JAVASCRIPT_RATIO times that of the reader in Python. Anything else is a failure, such as the end of node or another
 exception in Python, and the input is saved with its seed and number. It prints a summary with counts and seconds of CPU
-time, and exits with 1 after a failure.
+time, and exits with 1 after a failure. If a process of the reader in Python dies, the run ends, fails and says how many
+inputs were not compared; `tools.safety.fuzz` finds the input.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
 import json
 import multiprocessing
@@ -24,13 +26,16 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import torch
 
+from hyrfpack.atomic import check_writable, make_folder
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format import decode_model
 from hyrfpack.format.arrays import to_arrays
@@ -39,6 +44,7 @@ from hyrfpack.format.parts import decode_parts
 from hyrfpack.format.sections import SECTION_CONTENTS
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import parts_of
+from tools.command import positive_integer, run_command
 from tools.safety.fuzz import MAX_MESSAGE_CHARACTERS, generalize_message
 from tools.safety.fuzz_mutate import make_hostile_file
 
@@ -179,6 +185,7 @@ class Tally:
     failures: dict[int, str] = field(default_factory=dict)
 
     def add(self, other: Tally) -> None:
+        """Add the counts and failures of another tally."""
         for name in ("kinds", "accepted", "refused", "failures"):
             getattr(self, name).update(getattr(other, name))
         self.slowest = max(self.slowest, other.slowest)
@@ -204,6 +211,20 @@ def compare(numbers: Sequence[int], seed: int = 0) -> Tally:
     return tally
 
 
+def compare_in_processes(compare_batch: Callable[[Sequence[int]], Tally], count: int, jobs: int) -> Tally:
+    """Compare inputs 0 to `count` - 1 in processes; return the tally of all batches before the death of a process."""
+    tally = Tally()
+    batches = [range(first, min(first + INPUTS_PER_BATCH, count)) for first in range(0, count, INPUTS_PER_BATCH)]
+    # Unlike multiprocessing's pool, this one does not wait for ever for the batch of a process that has died.
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as executor:
+        with contextlib.suppress(BrokenProcessPool):
+            for result in as_completed([executor.submit(compare_batch, batch) for batch in batches]):
+                tally.add(result.result())
+                if sys.stderr.isatty():
+                    print(f"\r{tally.kinds.total():,} of {count:,}", end="", file=sys.stderr)
+    return tally
+
+
 def report(tally: Tally, seconds: float) -> str:
     """Format the summary of a run."""
     total = tally.kinds.total()
@@ -213,17 +234,20 @@ def report(tally: Tally, seconds: float) -> str:
         "\nkind of input            inputs  accepted",
         *(f"  {kind:<20} {count:>9,} {tally.accepted[kind]:>9,}" for kind, count in tally.kinds.most_common()),
         "\nmessages of refused inputs (JavaScript)",
-        *(f"  {count:>9,}  {sentence}" for sentence, count in tally.refused.most_common()),
+        *(f"  {count:>9,}  {message}" for message, count in tally.refused.most_common()),
     ]
     return "\n".join(lines)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--count", type=int, default=20_000, help="number of inputs (20,000)")
+    parser.add_argument("--count", type=positive_integer, default=20_000, help="number of inputs (20,000)")
     parser.add_argument("--seed", type=int, default=0, help="random seed of the inputs (0)")
     parser.add_argument(
-        "--jobs", type=int, default=multiprocessing.cpu_count(), help="number of worker processes (one per core)"
+        "--jobs",
+        type=positive_integer,
+        default=multiprocessing.cpu_count(),
+        help="number of worker processes (one per core)",
     )
     parser.add_argument(
         "--out",
@@ -234,17 +258,10 @@ def main() -> int:
     options = parser.parse_args()
     if not shutil.which("node"):
         parser.error("node is not installed; install Node.js 20 or newer")
-    start, tally = time.monotonic(), Tally()
-    batches = [
-        range(first, min(first + INPUTS_PER_BATCH, options.count))
-        for first in range(0, options.count, INPUTS_PER_BATCH)
-    ]
-    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
-        for part in pool.imap_unordered(partial(compare, seed=options.seed), batches):
-            tally.add(part)
-            if sys.stderr.isatty():
-                print(f"\r{tally.kinds.total():,} of {options.count:,}", end="", file=sys.stderr)
-    options.out.mkdir(parents=True, exist_ok=True)
+    make_folder(options.out)  # before the run, so that no result is lost
+    check_writable(options.out)
+    start = time.monotonic()
+    tally = compare_in_processes(partial(compare, seed=options.seed), options.count, options.jobs)
     text = report(tally, time.monotonic() - start)
     (options.out / f"report-{options.seed}.txt").write_text(text + "\n")
     print("\n" + text)
@@ -252,8 +269,10 @@ def main() -> int:
         path = options.out / f"{options.seed}-{number}.hyrf"
         path.write_bytes(make_hostile_file(number, options.seed)[1])
         print(f"FAILED {path}: {description[:600]}")
-    return 1 if tally.failures else 0
+    if missing := options.count - tally.kinds.total():
+        print(f"FAILED: {missing:,} inputs were not compared, because a process of the reader in Python died")
+    return 1 if tally.failures or missing else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_command(main)

@@ -45,6 +45,7 @@ from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.make.state import RECORD_NAME as RECORD
 from hyrfpack.train.checkpoint import DIGEST_BYTES
+from tools.command import positive_integer
 
 COMMAND_ENVIRONMENT = {**os.environ, "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
 COMMAND_NAMES = ("train", "compress", "decompress", "render", "make")  # each command reads the output of earlier ones
@@ -288,12 +289,12 @@ def prepare(work_folder: Path, names: Sequence[str]) -> list[Case]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=50, help="number of kills of each command (50)")
+    parser.add_argument("--kills", type=positive_integer, default=50, help="number of kills of each command (50)")
     parser.add_argument(
         "--commands", nargs="+", choices=COMMAND_NAMES, default=COMMAND_NAMES, help="commands to kill (all)"
     )
     parser.add_argument("--seed", type=int, default=0, help="random seed of the moments (0)")
-    parser.add_argument("--jobs", type=int, default=2, help="number of trials at the same time (2)")
+    parser.add_argument("--jobs", type=positive_integer, default=2, help="number of trials at the same time (2)")
     args = parser.parse_args()
     work_folder = Path(tempfile.mkdtemp(prefix="hyrfpack-kill-"))
     header = ("command", "seconds", "kills", *KILL_MOMENTS, "temporary files", "run again", "violations")

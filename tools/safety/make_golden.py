@@ -2,13 +2,14 @@
 
     python -m tools.safety.make_golden
 
-It prints one line for each file and keeps existing files. Golden files of a released format version never change. To
-replace one before the release, delete it by hand first.
+It prints one line for each file or scene folder, and keeps those that exist. Golden files of a released format version
+never change. To replace one before the release, delete it by hand first.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from hyrfpack.atomic import write_atomic
 from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.config.split import SplitConfig
 from hyrfpack.format import decode_model
@@ -196,6 +198,15 @@ def encode_golden_parts() -> bytes:
     return encode_parts([(name, (GOLDEN_FOLDER / f"{file}.hyrf").read_bytes()) for name, file in GOLDEN_PARTS.items()])
 
 
+def write_golden_file(target: Path, data: bytes, values: dict[str, np.ndarray]) -> None:
+    """Write a golden file and, beside it, the numbers that it must decode to."""
+    numbers = io.BytesIO()
+    np.savez_compressed(numbers, **values)
+    # An existing golden file is kept. So it comes last, lest an interruption leaves one without its numbers.
+    write_atomic(target.with_suffix(".npz"), numbers.getvalue())
+    write_atomic(target, data)
+
+
 def main() -> None:
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     for name, golden in GOLDEN_FILES.items():
@@ -208,21 +219,21 @@ def main() -> None:
         if golden.residual_degree is not None:
             model = add_golden_residuals(model, golden.residual_degree)
         data = encode(model, golden.profile, GOLDEN_PROVENANCE, **golden.settings)
-        values = expect_values(model, golden.profile, data)
-        GOLDEN_FOLDER.mkdir(exist_ok=True)
-        target.write_bytes(data)
-        np.savez_compressed(target.with_suffix(".npz"), **values)
+        write_golden_file(target, data, expect_values(model, golden.profile, data))
         print(f"{target}: {len(data)} bytes")
-    if not GOLDEN_MERGED_FILE.exists():
-        GOLDEN_MERGED_FILE.parent.mkdir(exist_ok=True)
-        GOLDEN_MERGED_FILE.write_bytes(encode_golden_parts())
+    if GOLDEN_MERGED_FILE.exists():
+        print(f"{GOLDEN_MERGED_FILE} exists and is kept")
+    else:
+        write_atomic(GOLDEN_MERGED_FILE, encode_golden_parts())
         print(f"{GOLDEN_MERGED_FILE}: {GOLDEN_MERGED_FILE.stat().st_size} bytes")
     scenes = {
         GOLDEN_SCENE_FOLDER: GOLDEN_FOLDER / f"{GOLDEN_SCENE_SOURCE}.hyrf",
         GOLDEN_PARTS_SCENE_FOLDER: GOLDEN_MERGED_FILE,
     }
     for folder, source in scenes.items():
-        if not folder.exists():
+        if folder.exists():
+            print(f"{folder} exists and is kept")
+        else:
             report = split_model(source, folder, SplitConfig(levels=1))
             print(f"{folder}: {report.bytes} bytes")
 

@@ -41,6 +41,7 @@ import hyrfpack.make  # noqa: F401 - these three are loaded before processes are
 from hyrfpack.cli import main as cli
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
+from tools.command import positive_integer
 from tools.safety.kill import COMMAND_ENVIRONMENT, is_temporary_file
 
 FOREIGN_BYTES = b"of another program"
@@ -229,7 +230,7 @@ def prepare(work_folder: Path) -> dict[str, Race]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = ("train", "compress", "export", "make")
-    parser.add_argument("--rounds", type=int, default=50, help="number of rounds of each race (50)")
+    parser.add_argument("--rounds", type=positive_integer, default=50, help="number of rounds of each race (50)")
     parser.add_argument("--races", nargs="+", choices=names, default=names, help="races to run (all)")
     parser.add_argument("--seed", type=int, default=0, help="random seed of the moments (0)")
     args = parser.parse_args()

@@ -23,6 +23,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from hyrfpack.demo.scene import write_demo_scene
+from tools.command import positive_integer
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
 DOCUMENTED_PAGES = (REPOSITORY_ROOT / "docs" / "reference" / "python-api.md", REPOSITORY_ROOT / "README.md")
@@ -78,25 +79,34 @@ def run_page(page: Path, data: Path, steps: int | None) -> bool:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("pages", nargs="*", type=Path, default=DOCUMENTED_PAGES)
+    parser.add_argument(
+        "pages",
+        nargs="*",
+        type=Path,
+        default=DOCUMENTED_PAGES,
+        help="pages to run (the Python API page and the README)",
+    )
     parser.add_argument("--data", type=Path, default=DEFAULT_PHOTOS_FOLDER, help="a folder of photos and poses")
-    parser.add_argument("--steps", type=int, help="limit of training steps (as written on the pages)")
+    parser.add_argument("--steps", type=positive_integer, help="limit of training steps (as written on the pages)")
     args = parser.parse_args()
+    for page in args.pages:
+        if not page.is_file():
+            parser.error(f"{page}: there is no such page; name Markdown files of the documentation")
     packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "torch", "pycolmap"))
     photos = args.data if args.data.is_dir() else f"a synthetic scene, because {args.data} does not exist"
     steps = "as many steps as written" if args.steps is None else f"at most {args.steps} steps"
     print(f"Python {platform.python_version()}, {packages}; {photos}; {steps}", flush=True)
-    broken = 0
+    has_failed = False
     for page in args.pages:
         print(f"== {page}", flush=True)
         started = time.perf_counter()
         succeeded = run_page(page, args.data, args.steps)
-        broken += not succeeded
+        has_failed |= not succeeded
         print(
             f"== {page}: {'ran as written' if succeeded else 'FAILED'}, {time.perf_counter() - started:.0f} s",
             flush=True,
         )
-    return min(broken, 1)
+    return int(has_failed)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from hyrfpack.atomic import write_atomic
 from hyrfpack.compress import compress_model
 from hyrfpack.context import RunContext
 from hyrfpack.data import load_scene
@@ -49,12 +50,11 @@ def make_golden_scene(model_file: Path, folder: Path) -> Scene:
 def main() -> None:
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     sys.path.append(str(TESTS_FOLDER))  # the scene of balls is a module of the tests
-    TRAINED_FOLDER.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         for target, config in TRAIN_CONFIGS.items():
             scene = make_golden_scene(target, Path(folder) / "photos")
             trained = train_model(scene, Path(folder) / target.stem, config, context=RunContext(progress=None))
-            target.write_bytes(trained.model.read_bytes())
+            write_atomic(target, trained.model.read_bytes())
             if target == DEMO_MODEL_FILE:
                 compress_model(target, DEMO_COMPACT_FILE, data=scene)
     for path in sorted(TRAINED_FOLDER.glob("*.hyrf")):
