@@ -13,7 +13,7 @@ from web.site import GOLDEN_FILE_DATA, Site
 from hyrfpack.web.assets import read_web_file
 from hyrfpack.web.scripts import is_minified_current
 from tools.browser.build_package import PACKAGE_FOLDER, build_package
-from tools.browser.build_player import PROGRAMS_FOLDER
+from tools.browser.node_programs import PROGRAMS_FOLDER
 
 pytestmark = pytest.mark.acceptance
 TESTS_FOLDER = Path(__file__).parents[1]

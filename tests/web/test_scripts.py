@@ -26,7 +26,8 @@ from hyrfpack.web.assets import list_web_files, read_web_file
 from hyrfpack.web.html import decode_splats_page
 from hyrfpack.web.player import encode_player
 from hyrfpack.web.scripts import DIGEST_NAME, SCRIPT_NAMES, is_minified_current, read_script, source_digest
-from tools.browser.build_player import PROGRAMS_FOLDER, build_player
+from tools.browser.build_player import build_player
+from tools.browser.node_programs import PROGRAMS_FOLDER
 
 CACHED_FUNCTIONS = (scripts.read_script, scripts.read_style, scripts.is_minified_current, player._pack_scripts)
 MAX_LINE_LENGTH = 120

@@ -13,7 +13,7 @@ from web.pages import SCENE_CENTER, Browser, make_splats_page, open_page, random
 from web.site import GOLDEN_FILE_DATA, Site, drop_file, serve_site
 
 from hyrfpack.web.player import encode_element_script, encode_player
-from tools.browser.build_player import PROGRAMS_FOLDER
+from tools.browser.node_programs import PROGRAMS_FOLDER
 
 pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
 LOADED_COUNT_JS = "hyrfpack.player.loaded && hyrfpack.player.scene.count"

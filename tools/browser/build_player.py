@@ -10,8 +10,6 @@ The same sources give the same bytes. It prints each file's length in bytes.
 from __future__ import annotations
 
 import argparse
-import subprocess
-from pathlib import Path
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.web.scripts import (
@@ -22,14 +20,14 @@ from hyrfpack.web.scripts import (
     STYLE_NAME,
     source_digest,
 )
+from tools.browser.node_programs import REPOSITORY_ROOT, run_node_program
+from tools.command import run_command
 
-REPOSITORY_ROOT = Path(__file__).parents[2]
 WEB_FOLDER = REPOSITORY_ROOT / "hyrfpack" / "web"
-PROGRAMS_FOLDER = REPOSITORY_ROOT / "tests" / "node" / "node_modules" / ".bin"
 ESBUILD_OPTIONS = (
     "--bundle --minify --format=iife --target=es2022 --charset=utf8 --legal-comments=none --log-level=warning"
 ).split()
-STRICT_MODE = '--banner:js="use strict";'  # modules are strict, and a script is not by itself
+STRICT_MODE_OPTION = '--banner:js="use strict";'  # modules are strict, and a script is not by itself
 TERSER_OPTIONS = "--ecma 2020 --mangle --compress passes=3,unsafe_arrows=true".split()
 
 
@@ -37,24 +35,19 @@ def build_player() -> dict[str, bytes]:
     """Return the minified files by name, and the digest of their sources.
 
     Raises:
-        SystemExit: esbuild or terser is not installed.
-        subprocess.CalledProcessError: one of them refuses a source; it has printed the reason.
+        HyrfError: esbuild or terser is not installed, or refuses a source.
     """
-    scripts = {name: _run("terser", *TERSER_OPTIONS, stdin=_bundle(name, STRICT_MODE)) for name in SCRIPT_NAMES}
+    scripts = {
+        name: run_node_program("terser", *TERSER_OPTIONS, stdin=_bundle(name, STRICT_MODE_OPTION))
+        for name in SCRIPT_NAMES
+    }
     styles = {name: _bundle(name) for name in (STYLE_NAME, EDITING_STYLE_NAME)}
     return scripts | styles | {DIGEST_NAME: f"{source_digest()}\n".encode()}
 
 
 def _bundle(name: str, *options: str) -> bytes:
     """Return a file of the player and all that it imports as one minified file."""
-    return _run("esbuild", str(WEB_FOLDER / "viewer" / name), *ESBUILD_OPTIONS, *options)
-
-
-def _run(name: str, *arguments: str, stdin: bytes = b"") -> bytes:
-    program = PROGRAMS_FOLDER / name
-    if not program.exists():
-        raise SystemExit(f"{program} is missing: install node, then run 'npm ci --prefix tests/node'")
-    return subprocess.run([program, *arguments], input=stdin, stdout=subprocess.PIPE, check=True).stdout
+    return run_node_program("esbuild", str(WEB_FOLDER / "viewer" / name), *ESBUILD_OPTIONS, *options)
 
 
 def main() -> None:
@@ -65,4 +58,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

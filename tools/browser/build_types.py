@@ -12,11 +12,11 @@ import argparse
 import json
 import re
 import shutil
-import subprocess
 import tempfile
 from pathlib import Path
 
-from tools.browser.build_player import PROGRAMS_FOLDER, REPOSITORY_ROOT
+from tools.browser.node_programs import REPOSITORY_ROOT, run_node_program
+from tools.command import run_command
 
 HYRF_FOLDER = REPOSITORY_ROOT / "hyrfpack" / "web" / "hyrf"
 TYPES_FOLDER = HYRF_FOLDER / "types"
@@ -37,23 +37,20 @@ def build_types() -> dict[str, str]:
     """Return the declarations of the public modules, and those to which these refer, by file name.
 
     Raises:
-        SystemExit: TypeScript is not installed, or it refuses a module; it has printed the reason.
+        HyrfError: TypeScript is not installed, or refuses a module.
     """
-    program = PROGRAMS_FOLDER / "tsc"
-    if not program.exists():
-        raise SystemExit(f"{program} is missing: install node, then run 'npm ci --prefix tests/node'")
     with tempfile.TemporaryDirectory() as folder:
-        command = [program, *TSC_OPTIONS, "--types", "", "--outDir", folder, *list_public_modules()]
-        if subprocess.run(command, cwd=HYRF_FOLDER).returncode:
-            raise SystemExit("the type declarations of hyrf.js could not be written")
+        options = [*TSC_OPTIONS, "--types", "", "--outDir", folder]
+        run_node_program("tsc", *options, *list_public_modules(), working_folder=HYRF_FOLDER)
         declarations = {path.name: path.read_text("utf-8") for path in sorted(Path(folder).iterdir())}
     # The compiler also writes those of modules that only implementations import.
-    needed: set[str] = set()
-    found = {declaration_name(module) for module in list_public_modules()}
-    while found - needed:
-        needed |= found
-        found = {declaration_name(name) for file in needed for name in MODULE_PATTERN.findall(declarations[file])}
-    return {name: text for name, text in declarations.items() if name in needed}
+    needed_names: set[str] = set()
+    referenced_names = {declaration_name(module) for module in list_public_modules()}
+    while referenced_names - needed_names:
+        needed_names |= referenced_names
+        texts = [declarations[name] for name in needed_names]
+        referenced_names = {declaration_name(module) for text in texts for module in MODULE_PATTERN.findall(text)}
+    return {name: text for name, text in declarations.items() if name in needed_names}
 
 
 def declaration_name(module: str) -> str:
@@ -72,4 +69,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)
