@@ -53,7 +53,7 @@ def wait_until(browser: chromium.Chromium, expression: str) -> None:
 
 @pytest.mark.acceptance
 def test_pictures_can_be_chosen_split_by_keys_and_pointer_and_subtracted(page: Path, tmp_path: Path):
-    if chromium.find() is None:
+    if chromium.find_program() is None:
         pytest.skip("there is no Chromium here")
     with chromium.Chromium() as browser:
         browser.resize(900, 700)

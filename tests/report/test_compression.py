@@ -155,7 +155,7 @@ def test_the_page_is_valid_and_refers_only_to_its_own_pictures(report_with_photo
 @pytest.mark.acceptance
 @pytest.mark.parametrize("program", [chromium.Chromium, firefox.Firefox])
 def test_browsers_show_all_pictures_under_the_content_security_policy(program, report_with_photos):
-    if importlib.import_module(program.__module__).find() is None:
+    if importlib.import_module(program.__module__).find_program() is None:
         pytest.skip(f"{program.__name__} is not on this machine")
     with program() as browser:
         browser.open((report_with_photos[0].parent / "page" / "index.html").as_uri())

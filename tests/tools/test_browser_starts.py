@@ -22,7 +22,7 @@ def test_a_display_with_a_strange_answer_is_ended(tmp_path: Path, monkeypatch: p
         os.kill(int((tmp_path / "Xvfb.pid").read_text()), 0)
 
 
-@pytest.mark.skipif(not firefox.find(), reason="Firefox or Xvfb is not installed")
+@pytest.mark.skipif(not firefox.find_program(), reason="Firefox or Xvfb is not installed")
 @pytest.mark.parametrize("program", ["/nowhere/firefox", "/bin/false"])
 def test_a_firefox_that_does_not_start_leaves_no_display(program: str, monkeypatch: pytest.MonkeyPatch):
     displays, start = [], firefox._start_display
@@ -32,16 +32,16 @@ def test_a_firefox_that_does_not_start_leaves_no_display(program: str, monkeypat
         return displays[-1]
 
     monkeypatch.setattr(firefox, "_start_display", start_display)
-    monkeypatch.setattr(firefox, "find", lambda: program)
+    monkeypatch.setattr(firefox, "find_program", lambda: program)
     with pytest.raises((TimeoutError, FileNotFoundError)):
         firefox.Firefox()
     assert displays[0][0].poll() is not None
 
 
-@pytest.mark.skipif(not chromium.find(), reason="Chromium or Playwright is not installed")
+@pytest.mark.skipif(not chromium.find_program(), reason="Chromium or Playwright is not installed")
 def test_a_chromium_that_does_not_start_leaves_no_thread(monkeypatch: pytest.MonkeyPatch):
     before = threading.enumerate()
-    monkeypatch.setattr(chromium, "find", lambda: "/bin/false")
+    monkeypatch.setattr(chromium, "find_program", lambda: "/bin/false")
     with pytest.raises(Exception, match="launch"):
         chromium.Chromium()
     assert threading.enumerate() == before

@@ -25,7 +25,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     The first of several parallel processes then runs all of these, and only it has to start browsers.
     """
     items.sort(key=lambda item: not item.path.is_relative_to(WEB_FOLDER))
-    if os.environ.get("HYRFPACK_BROWSERS") == "all" or None in (chromium.find(), firefox.find()):
+    if os.environ.get("HYRFPACK_BROWSERS") == "all" or None in (chromium.find_program(), firefox.find_program()):
         return
     left = {item for item in items if _is_turn_of_another_browser(item)}
     config.hook.pytest_deselected(items=list(left))
@@ -53,11 +53,11 @@ def start_browser() -> Iterator[Callable[[str], Browser]]:
         def start(name: str) -> Browser:
             if name not in running:
                 if name == "chromium":
-                    if chromium.find() is None:
+                    if chromium.find_program() is None:
                         pytest.skip("there is no Chromium here, or no Playwright to drive it")
                     running[name] = stack.enter_context(chromium.Chromium())
                 else:
-                    if firefox.find() is None:
+                    if firefox.find_program() is None:
                         pytest.skip("there is no Firefox here, or no Xvfb for it to draw on")
                     running[name] = stack.enter_context(firefox.Firefox())
             running[name].resize(*WINDOW_SIZE)

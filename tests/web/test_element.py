@@ -267,7 +267,7 @@ def test_an_element_whose_src_is_removed_frees_its_scene(browser: Browser, host:
 
 
 def test_reduced_motion_prevents_autorotation_until_a_script_requests_it(browser: Browser, host: Site):
-    browser.prefer(less_motion=True)
+    browser.prefer(reduced_motion=True)
     try:
         open_element(browser, host, 'src="cloud.spz" autorotate')
         wait_until(browser, LOADED_JS)

@@ -177,7 +177,7 @@ def read_saved_picture(browser: Browser) -> np.ndarray:
 @pytest.mark.parametrize("exposure", RENDER_EXPOSURES)
 def test_saved_pictures_and_the_window_have_the_chosen_exposure(browser: Browser, tmp_path: Path, exposure: str):
     model = random_model_with_map()
-    browser.prefer(less_motion=True)  # so that the canvas appears at once
+    browser.prefer(reduced_motion=True)  # so that the canvas appears at once
     open_complete_page(browser, tmp_path, make_model_page(model), "?noui")  # so that no notes cover the canvas
     set_exposure(browser, exposure)
     wait_until_complete(browser)

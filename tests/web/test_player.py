@@ -48,7 +48,7 @@ def test_the_window_starts_at_the_first_camera_and_draws_only_when_something_cha
 
 @pytest.mark.smoke
 def test_mouse_and_keys_move_the_camera(browser: Browser, tmp_path: Path):
-    browser.prefer(less_motion=True)  # the camera jumps to its target, which a test below shows to be the same
+    browser.prefer(reduced_motion=True)  # the camera jumps to its target, which a test below shows to be the same
     open_page(browser, tmp_path, make_splats_page(random_splats()))
     home = window_camera(browser)
 
@@ -150,11 +150,11 @@ def press_twice(browser: Browser, x: float, y: float, pointer: str) -> None:
     }})(document.getElementById('view'))""")
 
 
-@pytest.mark.parametrize("less_motion", [False, True], ids=["glide", "jump"])
+@pytest.mark.parametrize("reduced_motion", [False, True], ids=["glide", "jump"])
 def test_a_double_click_brings_its_place_to_the_center_and_orbits_it(
-    browser: Browser, tmp_path: Path, less_motion: bool
+    browser: Browser, tmp_path: Path, reduced_motion: bool
 ):
-    browser.prefer(less_motion=less_motion)
+    browser.prefer(reduced_motion=reduced_motion)
     one = random_splats(1, 0)
     place = SCENE_CENTER + 0.4 * make_camera().rotation[0] - 0.5 * make_camera().forward
     one = replace(one, positions=place[None], scales=np.full((1, 3), 0.05, np.float32), opacities=np.ones(1))
@@ -214,13 +214,13 @@ def current_position(browser: Browser) -> np.ndarray:
 
 def test_a_damped_drag_ends_exactly_where_an_undamped_one_does(browser: Browser, tmp_path: Path):
     ends = {}
-    for less_motion in (True, False):
-        browser.prefer(less_motion=less_motion)
+    for reduced_motion in (True, False):
+        browser.prefer(reduced_motion=reduced_motion)
         open_page(browser, tmp_path, make_splats_page(random_splats(50)))
         browser.drag((120, 90), (150, 110))
         wait_until_at_rest(browser).drag((120, 90), (110, 93), button="right")
         wait_until_at_rest(browser).wheel(60, 150, -200)
-        ends[less_motion] = window_camera(browser).camera_from_world
+        ends[reduced_motion] = window_camera(browser).camera_from_world
     np.testing.assert_allclose(ends[True], ends[False], atol=1e-9)
 
 
@@ -258,7 +258,7 @@ def test_a_glide_passes_between_its_ends_and_reduced_motion_jumps(browser: Brows
     turned = replace(
         make_camera(), camera_from_world=look_at(SCENE_CENTER + np.array([-2.0, -0.5, 1.5]), SCENE_CENTER, UP_DIRECTION)
     )
-    browser.prefer(less_motion=True)
+    browser.prefer(reduced_motion=True)
     open_page(browser, tmp_path, make_splats_page(random_splats(50), cameras=[make_camera(), turned]))
     browser.press("n")
     np.testing.assert_array_equal(current_position(browser), window_camera(browser).position)
@@ -322,7 +322,7 @@ def test_autorotation_waits_while_a_finger_is_down(browser: Browser, tmp_path: P
 
 
 def test_reduced_motion_prevents_autorotation_until_it_is_requested(browser: Browser, tmp_path: Path):
-    browser.prefer(less_motion=True)
+    browser.prefer(reduced_motion=True)
     open_page(browser, tmp_path, make_splats_page(random_splats(50)), "?autorotate")
     start = current_position(browser)
     time.sleep(0.3)

@@ -74,7 +74,7 @@ def test_the_page_reports_that_it_waits_for_the_first_step(browser: Browser):
 
 
 def test_a_newer_snapshot_replaces_the_previous_one_and_keeps_the_camera(browser: Browser):
-    browser.prefer(less_motion=True)
+    browser.prefer(reduced_motion=True)
     with open_training_page(browser, (encode_snapshot(20), 1)) as (training, _):
         wait_until(browser, f"{LOADED_COUNT_JS} === 20")
         home = window_camera(browser)

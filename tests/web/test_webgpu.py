@@ -108,7 +108,7 @@ async (cases) => {
 
 @pytest.fixture(scope="module")
 def webgpu_browser() -> Iterator[Browser]:
-    if chromium.find() is None:
+    if chromium.find_program() is None:
         pytest.skip("there is no Chromium here, or no Playwright to drive it")
     with chromium.Chromium(*chromium.WEBGPU_FLAGS) as browser:
         browser.resize(240, 400)

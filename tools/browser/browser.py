@@ -38,8 +38,8 @@ class Browser(ABC):
         """
 
     @abstractmethod
-    def resize(self, width: int, height: int, *, dense: float = 1.0, phone: bool = False) -> None:
-        """Set the window's size; `dense` is the device pixel ratio, `phone` emulates a touch screen."""
+    def resize(self, width: int, height: int, *, pixel_ratio: float = 1.0, phone: bool = False) -> None:
+        """Set the window's size; `pixel_ratio` is that of the device, `phone` emulates a touch screen."""
 
     @abstractmethod
     def move(self, x: float, y: float) -> None:
@@ -72,15 +72,20 @@ class Browser(ABC):
 
     @abstractmethod
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
-        """Send a touch event (touchStart, touchMove or touchEnd) with the points of all fingers that are down."""
+        """Send a touch event, of kind "touchStart", "touchMove" or "touchEnd".
+
+        Args:
+            kind: the kind of the event.
+            points: the positions of all fingers that are down after it.
+        """
 
     @abstractmethod
-    def prefer(self, scheme: str = "light", *, less_motion: bool = False) -> None:
+    def prefer(self, scheme: str = "light", *, reduced_motion: bool = False) -> None:
         """Emulate the user's preferences for a colour scheme and for reduced motion."""
 
     @abstractmethod
     def press(self, key: str, seconds: float = 0.0, *, shift: bool = False) -> None:
-        """Press a key, given as a letter or a key name, and release it after `seconds`."""
+        """Press a key, given as a letter or a name such as "ArrowLeft", and release it after `seconds`."""
 
     @abstractmethod
     def before_every_page(self, script: str) -> contextlib.AbstractContextManager[None]:

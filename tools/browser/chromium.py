@@ -32,7 +32,7 @@ SCREENCAST_SIZE = {"maxWidth": 640, "maxHeight": 400}  # pixels
 PROGRAM_NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 
-def find() -> str | None:
+def find_program() -> str | None:
     """Return the path of the installed browser; None if it or Playwright is missing."""
     if importlib.util.find_spec("playwright") is None:
         return None
@@ -71,7 +71,7 @@ class Chromium(Browser):
 
         self._playwright = await async_playwright().start()
         args = ["--disable-quic", *flags]
-        self._browser = await self._playwright.chromium.launch(executable_path=find(), args=args)
+        self._browser = await self._playwright.chromium.launch(executable_path=find_program(), args=args)
         self._page = await self._browser.new_page(no_viewport=True)  # `resize` sets the viewport
         self._devtools = await self._page.context.new_cdp_session(self._page)
         self._page.on("console", self._collect_message)
@@ -117,8 +117,8 @@ class Chromium(Browser):
         except Error as error:
             raise RuntimeError(str(error)) from error
 
-    def resize(self, width: int, height: int, *, dense: float = 1.0, phone: bool = False) -> None:
-        size = {"width": width, "height": height, "deviceScaleFactor": dense, "mobile": phone}
+    def resize(self, width: int, height: int, *, pixel_ratio: float = 1.0, phone: bool = False) -> None:
+        size = {"width": width, "height": height, "deviceScaleFactor": pixel_ratio, "mobile": phone}
         self._wait(self._devtools.send("Emulation.setDeviceMetricsOverride", size))
         self._wait(self._devtools.send("Emulation.setTouchEmulationEnabled", {"enabled": phone}))
 
@@ -141,8 +141,8 @@ class Chromium(Browser):
         fingers = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(points)]
         self._wait(self._devtools.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers}))
 
-    def prefer(self, scheme: str = "light", *, less_motion: bool = False) -> None:
-        motion = "reduce" if less_motion else "no-preference"
+    def prefer(self, scheme: str = "light", *, reduced_motion: bool = False) -> None:
+        motion = "reduce" if reduced_motion else "no-preference"
         self._wait(self._page.emulate_media(color_scheme=scheme, reduced_motion=motion))
 
     def press(self, key: str, seconds: float = 0.0, *, shift: bool = False) -> None:

@@ -52,7 +52,7 @@ WEBDRIVER_KEYS = {
 }  # fmt: skip
 
 
-def find() -> str | None:
+def find_program() -> str | None:
     """Return the path of the installed browser; None if it or Xvfb is missing."""
     return next(filter(None, map(shutil.which, PROGRAM_NAMES)), None) if shutil.which("Xvfb") else None
 
@@ -98,8 +98,9 @@ class Firefox(Browser):
         self._fingers: list[tuple[float, float]] = []
         self._number = 0
         self._received = b""
-        program = find()
-        assert program
+        program = find_program()
+        if program is None:
+            raise FileNotFoundError("Firefox or Xvfb is not installed")
         display, number = _start_display()
         self._processes = [display]
         environment = {"HOME": str(profile), "DISPLAY": f":{number}", "LIBGL_ALWAYS_SOFTWARE": "1"}
@@ -133,11 +134,11 @@ class Firefox(Browser):
             _end_process(process)
         self._folder.cleanup()
 
-    def _connect(self, file: Path) -> socket.socket:
+    def _connect(self, port_file: Path) -> socket.socket:
         deadline = time.monotonic() + TIMEOUT_SECONDS
         while time.monotonic() < deadline and self._process.poll() is None:
             with contextlib.suppress(OSError, ValueError):
-                return socket.create_connection(("127.0.0.1", int(file.read_text())), timeout=TIMEOUT_SECONDS)
+                return socket.create_connection(("127.0.0.1", int(port_file.read_text())), timeout=TIMEOUT_SECONDS)
             time.sleep(0.05)
         raise TimeoutError("Firefox did not open its Marionette port in time")
 
@@ -157,6 +158,7 @@ class Firefox(Browser):
             return result
 
     def _receive(self) -> Any:
+        """Return the next message of the browser, decoded from JSON."""
         while b":" not in self._received:
             self._receive_bytes()
         length, _, self._received = self._received.partition(b":")
@@ -171,7 +173,7 @@ class Firefox(Browser):
             raise RuntimeError("the browser has ended")
         self._received += data
 
-    def _privileged(self, script: str, *arguments: Any) -> Any:
+    def _run_privileged(self, script: str, *arguments: Any) -> Any:
         """Run a function body in the browser's own window and return its result."""
         self.call("Marionette:SetContext", value="chrome")
         try:
@@ -182,24 +184,24 @@ class Firefox(Browser):
     def _forward_console(self) -> None:
         """Forward console.error and console.warn from the pages' processes to the browser's window."""
         script = (
-            "{const tell = ({ wrappedJSObject: { level, innerID, arguments: said } }) => {"
+            "{const forward = ({ wrappedJSObject: { level, innerID, arguments: values } }) => {"
             '  if (typeof innerID !== "number") return;'  # it comes from a module of Firefox
-            '  if (level === "error" || level === "warn") sendAsyncMessage("said", said.map(String).join(" "));'
+            '  if (level === "error" || level === "warn") sendAsyncMessage("console", values.map(String).join(" "));'
             "};"
             'const storage = Cc["@mozilla.org/consoleAPI-storage;1"].getService(Ci.nsIConsoleAPIStorage);'
-            "storage.addLogEventListener(tell, Services.scriptSecurityManager.getSystemPrincipal());"
-            'addEventListener("unload", () => storage.removeLogEventListener(tell));}'
+            "storage.addLogEventListener(forward, Services.scriptSecurityManager.getSystemPrincipal());"
+            'addEventListener("unload", () => storage.removeLogEventListener(forward));}'
         )
-        self._privileged(
-            'window.said = []; const frames = window.getGroupMessageManager("browsers");'
-            'frames.addMessageListener("said", ({ data }) => window.said.push(data));'
+        self._run_privileged(
+            'window.consoleTexts = []; const frames = window.getGroupMessageManager("browsers");'
+            'frames.addMessageListener("console", ({ data }) => window.consoleTexts.push(data));'
             "frames.loadFrameScript(arguments[0], true);",
             _script_address(script),
         )
 
     def open(self, address: str) -> None:
         self.call("WebDriver:Navigate", url="about:blank")  # a change of the fragment alone would not reload
-        self._privileged("Services.console.reset(); window.said = [];")
+        self._run_privileged("Services.console.reset(); window.consoleTexts = [];")
         self.call("WebDriver:Navigate", url=address)
 
     def evaluate(self, expression: str) -> Any:
@@ -215,49 +217,52 @@ class Firefox(Browser):
             raise RuntimeError(answer["error"])
         return answer.get("value")
 
-    def resize(self, width: int, height: int, *, dense: float = 1.0, phone: bool = False) -> None:
-        self._privileged(
-            "const [width, height, dense, phone] = arguments, browser = gBrowser.selectedBrowser;"
+    def resize(self, width: int, height: int, *, pixel_ratio: float = 1.0, phone: bool = False) -> None:
+        self._run_privileged(
+            "const [width, height, pixelRatio, phone] = arguments, browser = gBrowser.selectedBrowser;"
             "for (const [name, value] of Object.entries({width, height})) {"
             '  for (const prefix of ["", "min-", "max-"]) browser.style.setProperty(prefix + name, value + "px");'
             "}"
             "const context = browser.browsingContext;"
             "context.inRDMPane = true;"
-            "context.overrideDPPX = dense;"
+            "context.overrideDPPX = pixelRatio;"
             'context.touchEventsOverride = phone ? "enabled" : "disabled";'
             # The pointer's capabilities are 1 for coarse, and 2 | 4 for fine with hover.
             'for (const which of ["primary", "all"]) {'
             "  Services.prefs.setIntPref(`ui.${which}PointerCapabilities`, phone ? 1 : 6);"
             "}",
-            width, height, dense, phone,
+            width, height, pixel_ratio, phone,
         )  # fmt: skip
         # Without a viewport element a page gets the layout of a larger window, as on phones.
-        seen = "document.querySelector('meta[name=viewport]') ? [innerWidth, innerHeight] : [outerWidth, outerHeight]"
+        layout_size = (
+            "document.querySelector('meta[name=viewport]') ? [innerWidth, innerHeight] : [outerWidth, outerHeight]"
+        )
         deadline = time.monotonic() + 5
-        while self.evaluate(seen) != [width, height] and time.monotonic() < deadline:
+        while self.evaluate(layout_size) != [width, height] and time.monotonic() < deadline:
             time.sleep(0.02)
 
-    def _act(self, *sources: dict) -> None:
+    def _perform_actions(self, *sources: dict) -> None:
+        """Perform the actions of input devices, those of all devices at the same time."""
         self.call("WebDriver:PerformActions", actions=list(sources))
 
-    def _point(self, x: float, y: float, *actions: dict) -> None:
+    def _act_with_mouse(self, x: float, y: float, *actions: dict) -> None:
         """Move the mouse, then perform actions of its buttons."""
         move = {"type": "pointerMove", "x": x, "y": y, "duration": 0, "origin": "viewport"}
         mouse = {"type": "pointer", "id": "mouse", "parameters": {"pointerType": "mouse"}}
-        self._act({**mouse, "actions": [move, *actions]})
+        self._perform_actions({**mouse, "actions": [move, *actions]})
 
     def move(self, x: float, y: float) -> None:
-        self._point(x, y)
+        self._act_with_mouse(x, y)
 
     def button_down(self, x: float, y: float, button: str = "left", clicks: int = 1) -> None:
-        self._point(x, y, {"type": "pointerDown", "button": MOUSE_BUTTONS[button]})
+        self._act_with_mouse(x, y, {"type": "pointerDown", "button": MOUSE_BUTTONS[button]})
 
     def button_up(self, x: float, y: float, button: str = "left", clicks: int = 1) -> None:
-        self._point(x, y, {"type": "pointerUp", "button": MOUSE_BUTTONS[button]})
+        self._act_with_mouse(x, y, {"type": "pointerUp", "button": MOUSE_BUTTONS[button]})
 
     def wheel(self, x: float, y: float, delta: float) -> None:
         scroll = {"type": "scroll", "x": x, "y": y, "duration": 0, "origin": "viewport", "deltaX": 0, "deltaY": delta}
-        self._act({"type": "wheel", "id": "wheel", "actions": [scroll]})
+        self._perform_actions({"type": "wheel", "id": "wheel", "actions": [scroll]})
 
     def touch(self, kind: str, *points: tuple[float, float]) -> None:
         sources = []
@@ -273,20 +278,20 @@ class Firefox(Browser):
             finger = {"type": "pointer", "id": f"finger {number}", "parameters": {"pointerType": "touch"}}
             sources.append({**finger, "actions": actions})
         self._fingers = list(points)
-        self._act(*sources)
+        self._perform_actions(*sources)
 
-    def prefer(self, scheme: str = "light", *, less_motion: bool = False) -> None:
-        self._privileged(
+    def prefer(self, scheme: str = "light", *, reduced_motion: bool = False) -> None:
+        self._run_privileged(
             'Services.prefs.setIntPref("layout.css.prefers-color-scheme.content-override", arguments[0]);'
             'Services.prefs.setIntPref("ui.prefersReducedMotion", arguments[1]);',
-            ["dark", "light"].index(scheme), int(less_motion),
+            ["dark", "light"].index(scheme), int(reduced_motion),
         )  # fmt: skip
 
     def press(self, key: str, seconds: float = 0.0, *, shift: bool = False) -> None:
         values = [*([WEBDRIVER_KEYS["Shift"]] if shift else []), WEBDRIVER_KEYS.get(key, key)]
         for kind in ("keyDown", "keyUp"):
             actions = [{"type": kind, "value": value} for value in values[:: 1 if kind == "keyDown" else -1]]
-            self._act({"type": "key", "id": "keys", "actions": actions})
+            self._perform_actions({"type": "key", "id": "keys", "actions": actions})
             time.sleep(seconds if kind == "keyDown" else 0)
 
     @contextlib.contextmanager
@@ -302,22 +307,22 @@ class Firefox(Browser):
         )
         address, forget = _script_address(text), f"forget {self._number}"
         frames = 'const frames = window.getGroupMessageManager("browsers");'
-        self._privileged(f"{frames} frames.loadFrameScript(arguments[0], true)", address)
+        self._run_privileged(f"{frames} frames.loadFrameScript(arguments[0], true)", address)
         try:
             yield
         finally:
             remove = "frames.removeDelayedFrameScript(arguments[0]); frames.broadcastAsyncMessage(arguments[1]);"
-            self._privileged(frames + remove, address, forget)
+            self._run_privileged(frames + remove, address, forget)
 
     def screenshot(self) -> bytes:
         return base64.b64decode(self.call("WebDriver:TakeScreenshot", full=False)["value"])
 
     def list_errors(self) -> list[str]:
         self.evaluate("new Promise((done) => setTimeout(done, 50))")  # earlier messages arrive within this time
-        return self._privileged(
-            "const found = Services.console.getMessageArray().filter((message) =>"
+        return self._run_privileged(
+            "const errors = Services.console.getMessageArray().filter((message) =>"
             "  message instanceof Ci.nsIScriptError && !(message.flags & 1) &&"
             # Errors that are thrown later, for example by timers, have no window id.
             '  (message.innerWindowID || message.category === "content javascript"));'
-            "return [...found.map(({ errorMessage }) => errorMessage), ...window.said];"
+            "return [...errors.map(({ errorMessage }) => errorMessage), ...window.consoleTexts];"
         )
