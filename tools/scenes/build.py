@@ -129,7 +129,11 @@ def make_sky(
     seed: int,
     sun_radius: float = 0.008,
 ) -> np.ndarray:
-    """Return a sky as `sky` reads it; colours are linear, the radius of the sun is in radians."""
+    """Return a row of numbers that describes a sky, as `sky.evaluate_sky` reads it.
+
+    Colours are linear. `cloud_share` is added to the noise of clouds; more of the sky is overcast at higher values. The
+    radius of the sun is in radians.
+    """
     row = np.zeros(sky.SKY_COLUMN_COUNT)
     row[sky.SUN_DIRECTION : sky.SUN_DIRECTION + 3] = np.asarray(sun_direction) / np.linalg.norm(sun_direction)
     row[sky.SUN_COLOR : sky.SUN_COLOR + 3] = sun_color

@@ -17,7 +17,7 @@ from tools.scenes.noise import inlined_kernel, kernel
 BOX, ELLIPSOID, CYLINDER_Z, CYLINDER_Y = range(4)
 MAX_FACES = 6
 MIN_HIT_DISTANCE = 1e-5
-_TINY = 1e-12
+_MIN_DIVISOR = 1e-12
 
 
 class SceneArrays(NamedTuple):
@@ -81,21 +81,21 @@ def hit_primitive(scene, i, ox, oy, oz, dx, dy, dz):
             return np.inf
         t = (-b - math.sqrt(root)) / a
         return t if t > MIN_HIT_DISTANCE else np.inf
-    if abs(w) < _TINY:
-        w = _TINY
+    if abs(w) < _MIN_DIVISOR:
+        w = _MIN_DIVISOR
     first, second = (-1.0 - z) / w, (1.0 - z) / w
     enter, leave = min(first, second), max(first, second)
     if shape == BOX:
-        if abs(u) < _TINY:
-            u = _TINY
-        if abs(v) < _TINY:
-            v = _TINY
+        if abs(u) < _MIN_DIVISOR:
+            u = _MIN_DIVISOR
+        if abs(v) < _MIN_DIVISOR:
+            v = _MIN_DIVISOR
         first, second = (-1.0 - x) / u, (1.0 - x) / u
         enter, leave = max(enter, min(first, second)), min(leave, max(first, second))
         first, second = (-1.0 - y) / v, (1.0 - y) / v
         enter, leave = max(enter, min(first, second)), min(leave, max(first, second))
     else:
-        a = max(u * u + v * v, _TINY * _TINY)
+        a = max(u * u + v * v, _MIN_DIVISOR * _MIN_DIVISOR)
         b = x * u + y * v
         root = b * b - a * (x * x + y * y - 1.0)
         if root <= 0.0:
@@ -123,7 +123,7 @@ def _misses_bounds(bounds, ox, oy, oz, ix, iy, iz, farthest):
 
 @inlined_kernel
 def _inverse(d):
-    return 1.0 / d if abs(d) > _TINY else 1.0 / _TINY
+    return 1.0 / d if abs(d) > _MIN_DIVISOR else 1.0 / _MIN_DIVISOR
 
 
 @kernel

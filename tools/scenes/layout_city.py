@@ -9,7 +9,7 @@ import numpy as np
 from hyrfpack.cameras.paths import look_at
 from tools.scenes import textures
 from tools.scenes.build import Frame, SceneBuilder, make_sky
-from tools.scenes.parts import add_tree, foliage
+from tools.scenes.parts import add_foliage_materials, add_tree
 
 TEXEL_METRES = 1.5
 FILL_LIGHT = 0.0
@@ -20,21 +20,21 @@ PITCH_METRES = BLOCK_METRES + STREET_METRES
 _LOT_METRES = BLOCK_METRES / 3
 _FLOOR_METRES = 3.1
 _MIN_FLOORS, _MAX_FLOORS = 2, 8
-_DRONE_SHARE = 0.6  # of the photos; the others are taken in the streets
-_DRONE_METRES = 70.0  # height; neighbouring photos of a hundred overlap by more than half
+_DRONE_PHOTO_SHARE = 0.6  # The other photos are taken in the streets.
+_DRONE_HEIGHT_METRES = 70.0  # At this height, neighbouring photos of a hundred overlap by more than half.
 _OBLIQUE_PITCH_DEGREES = 48.0
-_HALF_CITY = BLOCKS_PER_SIDE * PITCH_METRES / 2
-_UP = np.array([0.0, 0.0, 1.0])
+_HALF_CITY_METRES = BLOCKS_PER_SIDE * PITCH_METRES / 2
+_WORLD_UP = np.array([0.0, 0.0, 1.0])
 
 
-def sky(seed: int) -> np.ndarray:
+def describe_sky(seed: int) -> np.ndarray:
     """Return the sky of a clear morning with some clouds."""
     return make_sky(
         (0.55, -0.45, 0.70), (2.2, 2.05, 1.8), (0.62, 0.73, 0.88), (0.12, 0.27, 0.60), (0.2, 0.19, 0.17), -0.1, seed
     )
 
 
-def fill(builder: SceneBuilder) -> None:
+def add_primitives(builder: SceneBuilder) -> None:
     """Add all materials and primitives."""
     world, rng = builder.root, builder.rng
     parts = _CityMaterials(builder)
@@ -45,13 +45,13 @@ def fill(builder: SceneBuilder) -> None:
             _add_block(world.frame(*center), parts, rng)
 
 
-def cameras(count: int, rng: np.random.Generator) -> list[np.ndarray]:
+def place_cameras(count: int, rng: np.random.Generator) -> list[np.ndarray]:
     """Return (4, 4) camera_from_world of a drone's flight in lanes, and of walks along all streets."""
-    flown = math.ceil(_DRONE_SHARE * count)
-    return [*_fly(flown, rng), *_walk(count - flown, rng)]
+    drone_count = math.ceil(_DRONE_PHOTO_SHARE * count)
+    return [*_place_drone_cameras(drone_count, rng), *_place_street_cameras(count - drone_count, rng)]
 
 
-def _fly(count: int, rng: np.random.Generator) -> list[np.ndarray]:
+def _place_drone_cameras(count: int, rng: np.random.Generator) -> list[np.ndarray]:
     """Return poses on lanes over the city: of each five photos, one looks down and four look obliquely around."""
     lanes = max(1, round(math.sqrt(count)))
     poses = []
@@ -59,32 +59,34 @@ def _fly(count: int, rng: np.random.Generator) -> list[np.ndarray]:
         lane, place = divmod(n * lanes / count, 1)
         along = (place if int(lane) % 2 == 0 else 1 - place) - 0.5
         across = (lane + 0.5) / lanes - 0.5
-        position = np.array([2 * _HALF_CITY * along, 2 * _HALF_CITY * across, _DRONE_METRES]) + rng.uniform(-2, 2, 3)
+        position = np.array(
+            [2 * _HALF_CITY_METRES * along, 2 * _HALF_CITY_METRES * across, _DRONE_HEIGHT_METRES]
+        ) + rng.uniform(-2, 2, 3)
         turn, kind = math.pi / 2 * (n % 5) + rng.uniform(-0.1, 0.1), n % 5
         pitch = math.radians(88 if kind == 4 else _OBLIQUE_PITCH_DEGREES) + rng.uniform(-0.02, 0.02)
-        poses.append(_pose(position, turn, -pitch))
+        poses.append(_make_pose(position, turn, -pitch))
     return poses
 
 
-def _walk(count: int, rng: np.random.Generator) -> list[np.ndarray]:
+def _place_street_cameras(count: int, rng: np.random.Generator) -> list[np.ndarray]:
     """Return poses in the middle of the streets between blocks, which look ahead and to both sides."""
     streets = 2 * (BLOCKS_PER_SIDE - 1)
     poses = []
     for n in range(count):
         street, step = n % streets, (n // streets + 0.5) / math.ceil(count / streets)
-        along = (2 * step - 1) * (_HALF_CITY - STREET_METRES / 2)
+        along = (2 * step - 1) * (_HALF_CITY_METRES - STREET_METRES / 2)
         across = (street // 2 + 1 - BLOCKS_PER_SIDE / 2) * PITCH_METRES + rng.uniform(-1.2, 1.2)
         is_northward = street % 2 == 0
         position = np.array([across, along, 0.0] if is_northward else [along, across, 0.0])
         position[2] = 1.7 + rng.uniform(-0.1, 0.1)
         turn = math.pi / 2 * is_northward + math.radians((0, 40, -40, 180, 140, -140)[n // streets % 6])
-        poses.append(_pose(position, turn + rng.uniform(-0.1, 0.1), math.radians(12)))
+        poses.append(_make_pose(position, turn + rng.uniform(-0.1, 0.1), math.radians(12)))
     return poses
 
 
-def _pose(position: np.ndarray, turn: float, pitch: float) -> np.ndarray:
+def _make_pose(position: np.ndarray, turn: float, pitch: float) -> np.ndarray:
     forward = np.array([math.cos(turn) * math.cos(pitch), math.sin(turn) * math.cos(pitch), math.sin(pitch)])
-    return look_at(position, position + forward, _UP)
+    return look_at(position, position + forward, _WORLD_UP)
 
 
 class _CityMaterials:
@@ -134,17 +136,19 @@ class _CityMaterials:
             for color in ((0.05, 0.12, 0.30), (0.45, 0.05, 0.04), (0.50, 0.50, 0.50), (0.03, 0.03, 0.03))
         ]
         self.bark = add(textures.MIX, (0.10, 0.07, 0.05), (0.20, 0.15, 0.11), scale=(0.15, 0.85), contrast=0.5)
-        self.leaves = foliage(builder, 0.25)
+        self.leaves = add_foliage_materials(builder, 0.25)
 
 
 def _add_streets(world: Frame, parts: _CityMaterials) -> None:
-    reach = _HALF_CITY + 80
+    reach = _HALF_CITY_METRES + 80
     world.box((-reach, -reach, -0.6), (reach, reach, -0.15), parts.grass)
-    world.box((-_HALF_CITY, -_HALF_CITY, -0.6), (_HALF_CITY, _HALF_CITY, 0.0), parts.asphalt)
+    world.box(
+        (-_HALF_CITY_METRES, -_HALF_CITY_METRES, -0.6), (_HALF_CITY_METRES, _HALF_CITY_METRES, 0.0), parts.asphalt
+    )
     for street in range(1, BLOCKS_PER_SIDE):
         across = (street - BLOCKS_PER_SIDE / 2) * PITCH_METRES
-        for n in range(round(2 * _HALF_CITY / 8)):
-            along = -_HALF_CITY + 8 * n
+        for n in range(round(2 * _HALF_CITY_METRES / 8)):
+            along = -_HALF_CITY_METRES + 8 * n
             world.box((across - 0.12, along, -0.02), (across + 0.12, along + 4, 0.006), parts.paint)
             world.box((along, across - 0.12, -0.02), (along + 4, across + 0.12, 0.005), parts.paint)
 

@@ -9,35 +9,35 @@ import numpy as np
 from hyrfpack.cameras.paths import look_at
 from tools.scenes import textures
 from tools.scenes.build import Frame, SceneBuilder, make_sky
-from tools.scenes.parts import add_books, add_bush, add_chair, add_tree, book_covers, foliage
+from tools.scenes.parts import add_books, add_bush, add_chair, add_cover_materials, add_foliage_materials, add_tree
 
-TABLE_HEIGHT = 0.74
+TABLE_HEIGHT_METRES = 0.74
 TEXEL_METRES = 0.04
 FILL_LIGHT = 0.0
 EXPOSURE_FACTOR = 0.95
-_UP = np.array([0.0, 0.0, 1.0])
+_WORLD_UP = np.array([0.0, 0.0, 1.0])
 
 
-def sky(seed: int) -> np.ndarray:
+def describe_sky(seed: int) -> np.ndarray:
     """Return the sky of a sunny afternoon."""
     return make_sky(
         (0.55, -0.50, 0.62), (2.15, 1.92, 1.62), (0.62, 0.72, 0.86), (0.12, 0.26, 0.58), (0.2, 0.2, 0.16), 0.15, seed
     )
 
 
-def fill(builder: SceneBuilder) -> None:
+def add_primitives(builder: SceneBuilder) -> None:
     """Add all materials and primitives."""
     world = builder.root
-    leaves = foliage(builder, 0.035)
+    leaves = add_foliage_materials(builder, 0.035)
     _add_garden(world, leaves)
     table = world.frame(0, 0, 0, 0.2)
     _add_table(table)
-    top = world.frame(0, 0, TABLE_HEIGHT, 0.2)
+    top = world.frame(0, 0, TABLE_HEIGHT_METRES, 0.2)
     _add_things(top)
     _add_train(top.frame(0.0, 0.0, 0.0, 0.25))
 
 
-def cameras(count: int, rng: np.random.Generator) -> list[np.ndarray]:
+def place_cameras(count: int, rng: np.random.Generator) -> list[np.ndarray]:
     """Return (4, 4) camera_from_world of three rings around the table."""
     poses = []
     rings = [
@@ -52,11 +52,11 @@ def cameras(count: int, rng: np.random.Generator) -> list[np.ndarray]:
             angle = start + 2 * math.pi * (n + rng.uniform(-0.15, 0.15)) / photos
             r = radius * rng.uniform(0.94, 1.08)
             position = np.array(
-                [r * math.cos(angle), r * math.sin(angle), TABLE_HEIGHT + height + rng.uniform(-0.03, 0.03)]
+                [r * math.cos(angle), r * math.sin(angle), TABLE_HEIGHT_METRES + height + rng.uniform(-0.03, 0.03)]
             )
-            target = np.array([*rng.uniform(-0.05, 0.05, 2), TABLE_HEIGHT + aim + rng.uniform(-0.02, 0.03)])
+            target = np.array([*rng.uniform(-0.05, 0.05, 2), TABLE_HEIGHT_METRES + aim + rng.uniform(-0.02, 0.03)])
             roll = rng.normal() * 0.02
-            up = _UP + roll * np.array([-math.sin(angle), math.cos(angle), 0.0])
+            up = _WORLD_UP + roll * np.array([-math.sin(angle), math.cos(angle), 0.0])
             poses.append(look_at(position, target, up / np.linalg.norm(up)))
     return poses
 
@@ -139,11 +139,11 @@ def _add_table(table: Frame) -> None:
         reflectance=0.025, shininess=50,
     )  # fmt: skip
     legs = b.material(textures.WOOD, (0.45, 0.27, 0.13), (0.26, 0.13, 0.06), contrast=0.2)
-    table.box((-0.72, -0.52, TABLE_HEIGHT - 0.035), (0.72, 0.52, TABLE_HEIGHT), top)
-    table.box((-0.62, -0.42, TABLE_HEIGHT - 0.12), (0.62, 0.42, TABLE_HEIGHT - 0.04), legs)
+    table.box((-0.72, -0.52, TABLE_HEIGHT_METRES - 0.035), (0.72, 0.52, TABLE_HEIGHT_METRES), top)
+    table.box((-0.62, -0.42, TABLE_HEIGHT_METRES - 0.12), (0.62, 0.42, TABLE_HEIGHT_METRES - 0.04), legs)
     for x in (-0.6, 0.6):
         for y in (-0.4, 0.4):
-            table.box((x - 0.04, y - 0.04, 0), (x + 0.04, y + 0.04, TABLE_HEIGHT - 0.04), legs)
+            table.box((x - 0.04, y - 0.04, 0), (x + 0.04, y + 0.04, TABLE_HEIGHT_METRES - 0.04), legs)
 
 
 def _add_things(top: Frame) -> None:
@@ -175,7 +175,7 @@ def _add_things(top: Frame) -> None:
         reflectance=0.05,
         shininess=120,
     )
-    covers = book_covers(b)
+    covers = add_cover_materials(b)
     stone = b.material(
         textures.TERRAZZO,
         (0.60, 0.58, 0.54),

@@ -9,17 +9,17 @@ import numpy as np
 from hyrfpack.cameras.paths import look_at
 from tools.scenes import textures
 from tools.scenes.build import Frame, SceneBuilder, make_sky
-from tools.scenes.parts import add_books, add_bush, add_chair, add_tree, book_covers, foliage
+from tools.scenes.parts import add_books, add_bush, add_chair, add_cover_materials, add_foliage_materials, add_tree
 
 ROOM_WIDTH, ROOM_DEPTH, ROOM_HEIGHT = 5.2, 4.4, 2.6  # metres along x, y, z
 TEXEL_METRES = 0.08
 EXPOSURE_FACTOR = 8.5
 FILL_LIGHT = 0.015  # light of lamps, and the lift of shadows that phones apply indoors
-_UP = np.array([0.0, 0.0, 1.0])
-_ACROSS_SHARE = 0.6  # of the photos look across the room, the others at the nearest wall
+_WORLD_UP = np.array([0.0, 0.0, 1.0])
+_INWARD_PHOTO_SHARE = 0.6  # These look across the room, the others at the nearest wall.
 
 
-def sky(seed: int) -> np.ndarray:
+def describe_sky(seed: int) -> np.ndarray:
     """Return the sky of a sunny morning, with the sun in the windows."""
     return make_sky(
         (0.42, 0.62, 0.60),
@@ -33,7 +33,7 @@ def sky(seed: int) -> np.ndarray:
     )
 
 
-def fill(builder: SceneBuilder) -> None:
+def add_primitives(builder: SceneBuilder) -> None:
     """Add all materials and primitives."""
     world = builder.root
     wood = builder.material(textures.WOOD, (0.46, 0.28, 0.14), (0.27, 0.14, 0.06), contrast=0.2, reflectance=0.03)
@@ -47,10 +47,10 @@ def fill(builder: SceneBuilder) -> None:
     _add_corners(world, wood, white)
 
 
-def cameras(count: int, rng: np.random.Generator) -> list[np.ndarray]:
+def place_cameras(count: int, rng: np.random.Generator) -> list[np.ndarray]:
     """Return (4, 4) camera_from_world: a walk around the table that looks across it, then one that looks outwards."""
     poses = []
-    across = round(_ACROSS_SHARE * count)
+    across = round(_INWARD_PHOTO_SHARE * count)
     for n in range(count):
         looks_across = n < across
         step = n / across if looks_across else (n - across) / (count - across)
@@ -68,7 +68,7 @@ def cameras(count: int, rng: np.random.Generator) -> list[np.ndarray]:
         pitch = math.radians(-16 if looks_across else -9) + 0.1 * math.sin(3 * angle + 1.0)
         forward = np.array([math.cos(heading) * math.cos(pitch), math.sin(heading) * math.cos(pitch), math.sin(pitch)])
         side = np.array([-math.sin(heading), math.cos(heading), 0.0])
-        up = _UP + 0.02 * rng.normal() * side
+        up = _WORLD_UP + 0.02 * rng.normal() * side
         poses.append(look_at(position, position + forward, up / np.linalg.norm(up)))
     return poses
 
@@ -195,7 +195,7 @@ def _add_pictures(world: Frame, wood: int, glass: int) -> None:
 
 def _add_outside(world: Frame) -> None:
     b = world.builder
-    leaves = foliage(b, 0.09)
+    leaves = add_foliage_materials(b, 0.09)
     lawn = b.material(textures.MIX, (0.07, 0.13, 0.03), (0.2, 0.25, 0.08), scale=(1.2, 0.85), contrast=0.3)
     bark = b.material(textures.STONE, (0.10, 0.07, 0.05), (0.22, 0.17, 0.12), scale=(0.1, 1), contrast=0.4)
     house = b.material(
@@ -276,7 +276,7 @@ def _add_table(table: Frame, wood: int) -> None:
 def _add_shelf(shelf: Frame, wood: int) -> None:
     """Add a shelf with books; it stands with its back at y = 0 and is 1.9 m wide along x."""
     b = shelf.builder
-    covers = book_covers(b)
+    covers = add_cover_materials(b)
     jug = b.material(
         textures.STONE, (0.60, 0.50, 0.36), (0.18, 0.26, 0.30), scale=(0.08, 1), contrast=0.15, reflectance=0.04
     )
@@ -327,7 +327,7 @@ def _add_sofa(sofa: Frame) -> None:
 def _add_sideboard(board: Frame, wood: int, white: int) -> None:
     """Add a sideboard with its back at y = +0.25, towards the wall, and things on it."""
     b = board.builder
-    covers = book_covers(b)
+    covers = add_cover_materials(b)
     front = b.material(textures.WOOD, (0.36, 0.20, 0.10), (0.20, 0.10, 0.05), contrast=0.3, reflectance=0.03, swap=True)
     brass = b.material(textures.PLAIN, (0.78, 0.56, 0.24), contrast=0.1, reflectance=0.8, shininess=150, metal=True)
     screen = b.material(textures.PLAIN, (0.01, 0.01, 0.012), contrast=0.1, reflectance=0.06, shininess=800)
@@ -335,7 +335,7 @@ def _add_sideboard(board: Frame, wood: int, white: int) -> None:
         textures.TEXT, (0.55, 0.48, 0.36), (0.1, 0.25, 0.3), scale=(0.02, 0.03), contrast=0.15, varied=True
     )
     clay = b.material(textures.STONE, (0.42, 0.20, 0.12), (0.62, 0.42, 0.28), scale=(0.1, 1), contrast=0.2)
-    leaves = foliage(b, 0.04)
+    leaves = add_foliage_materials(b, 0.04)
     board.box((-0.85, -0.22, 0.08), (0.85, 0.25, 0.72), wood)
     board.box((-0.88, -0.24, 0.72), (0.88, 0.25, 0.75), wood)
     for n in range(3):
@@ -358,7 +358,7 @@ def _add_sideboard(board: Frame, wood: int, white: int) -> None:
 def _add_corners(world: Frame, wood: int, white: int) -> None:
     """Add a floor lamp, plants, a lamp above the table, boxes and a chest."""
     b = world.builder
-    leaves = foliage(b, 0.05)
+    leaves = add_foliage_materials(b, 0.05)
     shade = b.material(textures.STRIPES, (0.72, 0.62, 0.42), (0.60, 0.46, 0.28), scale=(0.03, 1), contrast=0.15)
     black = b.material(textures.PLAIN, (0.04, 0.04, 0.045), contrast=0.2, reflectance=0.04, shininess=100)
     basket = b.material(

@@ -9,29 +9,29 @@ import numpy as np
 from hyrfpack.cameras.paths import look_at
 from tools.scenes import textures
 from tools.scenes.build import Frame, SceneBuilder, make_sky
-from tools.scenes.parts import add_bush, add_tree, foliage
+from tools.scenes.parts import add_bush, add_foliage_materials, add_tree
 
 TEXEL_METRES = 0.25
 FILL_LIGHT = 0.0
 EXPOSURE_FACTOR = 0.95
-_UP = np.array([0.0, 0.0, 1.0])
-_HOUSE_WIDTHS = (6.2, 5.2, 7.4, 5.6, 6.6, 5.8, 7.0)  # metres
-_ROW_START = -22.0
+_WORLD_UP = np.array([0.0, 0.0, 1.0])
+_HOUSE_WIDTHS_METRES = (6.2, 5.2, 7.4, 5.6, 6.6, 5.8, 7.0)
+_ROW_START_X_METRES = -22.0
 _WALK_METRES = 24.0  # length of the walk, whose middle is at x = 0
-_KERB_Y, _FAR_KERB_Y = -2.6, -8.6  # the fronts are at y = 0
+_KERB_Y_METRES, _FAR_KERB_Y_METRES = -2.6, -8.6  # the fronts are at y = 0
 
 
-def sky(seed: int) -> np.ndarray:
+def describe_sky(seed: int) -> np.ndarray:
     """Return the sky of a summer day with clouds."""
     return make_sky(
         (-0.52, -0.58, 0.63), (2.2, 2.0, 1.7), (0.62, 0.73, 0.88), (0.10, 0.24, 0.58), (0.2, 0.19, 0.17), 0.0, seed
     )
 
 
-def fill(builder: SceneBuilder) -> None:
+def add_primitives(builder: SceneBuilder) -> None:
     """Add all materials and primitives."""
     world = builder.root
-    leaves = foliage(builder, 0.07)
+    leaves = add_foliage_materials(builder, 0.07)
     _add_ground(world)
     _add_row(world)
     _add_opposite_side(world, leaves)
@@ -40,7 +40,7 @@ def fill(builder: SceneBuilder) -> None:
     _add_car(world.frame(7.5, -3.8, 0.0, 0.0), (0.45, 0.05, 0.04))
 
 
-def cameras(count: int, rng: np.random.Generator) -> list[np.ndarray]:
+def place_cameras(count: int, rng: np.random.Generator) -> list[np.ndarray]:
     """Return (4, 4) camera_from_world of two walks: along the far pavement, and back on the road."""
     poses = []
     first = count // 2
@@ -54,7 +54,7 @@ def cameras(count: int, rng: np.random.Generator) -> list[np.ndarray]:
         turn = math.radians((-32, 0, 32)[n % 3] if is_far else (-42, -12, 38)[n % 3]) + rng.uniform(-0.06, 0.06)
         pitch = math.radians(7 if is_far else 10) + rng.uniform(-0.03, 0.03)
         forward = np.array([math.sin(turn) * math.cos(pitch), math.cos(turn) * math.cos(pitch), math.sin(pitch)])
-        up = _UP + 0.015 * rng.normal() * np.array([math.cos(turn), -math.sin(turn), 0.0])
+        up = _WORLD_UP + 0.015 * rng.normal() * np.array([math.cos(turn), -math.sin(turn), 0.0])
         poses.append(look_at(position, position + forward, up / np.linalg.norm(up)))
     return poses
 
@@ -73,10 +73,10 @@ def _add_ground(world: Frame) -> None:
     iron = b.material(textures.CARPET, (0.08, 0.075, 0.07), (0.17, 0.15, 0.14), scale=(0.2, 0.022), contrast=0.3)
     patch = b.material(textures.MIX, (0.045, 0.045, 0.05), (0.10, 0.10, 0.10), scale=(0.5, 0.85), contrast=0.35)
     world.box((-70, -60, -0.4), (70, 60, -0.12), asphalt)
-    world.box((-60, _KERB_Y, -0.4), (60, 0.5, 0.0), slabs)
-    world.box((-60, _FAR_KERB_Y - 2.6, -0.4), (60, _FAR_KERB_Y, 0.0), slabs)
-    world.box((-60, _KERB_Y - 0.14, -0.4), (60, _KERB_Y, 0.012), kerb)
-    world.box((-60, _FAR_KERB_Y, -0.4), (60, _FAR_KERB_Y + 0.14, 0.012), kerb)
+    world.box((-60, _KERB_Y_METRES, -0.4), (60, 0.5, 0.0), slabs)
+    world.box((-60, _FAR_KERB_Y_METRES - 2.6, -0.4), (60, _FAR_KERB_Y_METRES, 0.0), slabs)
+    world.box((-60, _KERB_Y_METRES - 0.14, -0.4), (60, _KERB_Y_METRES, 0.012), kerb)
+    world.box((-60, _FAR_KERB_Y_METRES, -0.4), (60, _FAR_KERB_Y_METRES + 0.14, 0.012), kerb)
     for n in range(24):
         world.box((-36 + 3.0 * n, -5.66, -0.14), (-34.4 + 3.0 * n, -5.54, -0.117), paint)
     for x, y, size in ((-7.2, -4.6, 0.62), (2.6, -6.6, 0.62), (10.5, -4.9, 0.62)):
@@ -106,11 +106,11 @@ def _add_row(world: Frame) -> None:
         ),
         b.material(textures.PLAIN, (0.55, 0.34, 0.25), scale=(0.9, 0.78), contrast=0.16),
     ]  # fmt: skip
-    x = _ROW_START
-    for n, width in enumerate(_HOUSE_WIDTHS):
+    x = _ROW_START_X_METRES
+    for n, width in enumerate(_HOUSE_WIDTHS_METRES):
         _add_house(world.frame(x, 0.05 * (n % 3)), n, width, fronts[n])
         x += width
-    for side in (_ROW_START - 9.0, x):  # plain houses continue the row at both ends
+    for side in (_ROW_START_X_METRES - 9.0, x):  # plain houses continue the row at both ends
         world.box((side, 0.6, -0.2), (side + 9.0, 8, 7.0), fronts[4])
 
 
@@ -265,11 +265,11 @@ def _add_street_things(world: Frame, leaves: list[int]) -> None:
     poster = b.material(textures.PICTURE, (0, 0, 0), scale=(0.35, 1), contrast=0.5, varied=True)
     sign = b.material(textures.TEXT, (0.70, 0.70, 0.66), (0.55, 0.05, 0.04), scale=(0.11, 0.2), varied=True)
     for x in (-11.0, 1.8, 13.0):
-        place = world.frame(x, _KERB_Y + 0.75)
+        place = world.frame(x, _KERB_Y_METRES + 0.75)
         place.box((-0.5, -0.5, -0.1), (0.5, 0.5, 0.015), soil)
         add_tree(place, 4.6, 2.5, bark, leaves, 70)
     for x in (-7.0, 6.2):  # street lamps
-        place = world.frame(x, _KERB_Y + 0.35)
+        place = world.frame(x, _KERB_Y_METRES + 0.35)
         place.post((0, 0, 0), 0.2, 0.5, steel)
         place.post((0, 0, 0.5), 0.1, 3.7, steel)
         place.block((0, -0.3, 4.15), (0.16, 0.7, 0.08), steel)
@@ -302,7 +302,7 @@ def _add_street_things(world: Frame, leaves: list[int]) -> None:
         pot.post((0, 0, 0.4), 0.52, 0.06, clay)
         add_bush(pot.frame(0, 0, 0.4), 0.7, 0.7 + 0.15 * (n % 3), leaves)
     for n in range(12):  # bollards
-        place = world.frame(-16.5 + 3.0 * n, _KERB_Y + 0.22)
+        place = world.frame(-16.5 + 3.0 * n, _KERB_Y_METRES + 0.22)
         place.post((0, 0, 0), 0.12, 0.8, steel)
         place.ellipsoid((0, 0, 0.8), (0.16, 0.16, 0.14), steel)
 

@@ -16,9 +16,9 @@ from tools.scenes.noise import hash_unit, kernel
 from tools.scenes.shading import SURFACE_OFFSET_METRES, trace_matte
 
 _TEXELS_PER_TASK = 256
-_GATHER_FOOTPRINT = 0.15  # metres; finer texture does not change the light that surfaces exchange
-_GATHER_SPREAD = 0.1
-_FILL_ROUNDS = 12
+_GATHER_FOOTPRINT_METRES = 0.15  # Finer texture does not change the light that surfaces exchange.
+_GATHER_FOOTPRINT_PER_METRE = 0.1
+_MAX_FILL_ROUNDS = 12
 
 
 @kernel
@@ -64,8 +64,8 @@ def _gather(scene, texels, first, last, rays, light):
                 p * ax + q * bx + h * nx,
                 p * ay + q * by + h * ny,
                 p * az + q * bz + h * nz,
-                _GATHER_FOOTPRINT,
-                _GATHER_SPREAD,
+                _GATHER_FOOTPRINT_METRES,
+                _GATHER_FOOTPRINT_PER_METRE,
                 False,
             )
             red, green, blue = red + r, green + g, blue + c
@@ -94,6 +94,7 @@ def add_indirect_light(scene: SceneArrays, rays: int, rounds: int) -> SceneArray
 
 
 def _list_texels(scene: SceneArrays) -> np.ndarray:
+    """Return primitive, face, column and row of each light texel, (T, 4), in the order of `SceneArrays.light`."""
     rows = []
     for i in range(len(scene.shape)):
         for face, (columns, lines) in enumerate(scene.light_size[i]):
@@ -117,9 +118,10 @@ def _smooth(scene: SceneArrays, light: np.ndarray) -> np.ndarray:
 
 
 def _smooth_face(values: np.ndarray) -> np.ndarray:
+    """Return the blurred light (rows, columns, 3) of one face; unknown texels (NaN) grow in from known neighbours."""
     known = np.isfinite(values[..., :1]).astype(np.float32)
     values = np.where(known > 0, values, 0)
-    for round_number in range(_FILL_ROUNDS):
+    for round_number in range(_MAX_FILL_ROUNDS):
         weight, total = _blur(known), _blur(values * known)
         average = total / np.maximum(weight, 1e-6)
         if round_number == 0:
@@ -133,6 +135,7 @@ def _smooth_face(values: np.ndarray) -> np.ndarray:
 
 
 def _blur(values: np.ndarray) -> np.ndarray:
+    """Convolve the first two axes with (1, 2, 1) / 4; edges are repeated."""
     for axis in (0, 1):
         padded = np.concatenate([values.take([0], axis), values, values.take([-1], axis)], axis)
         length = values.shape[axis]

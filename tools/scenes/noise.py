@@ -15,18 +15,18 @@ kernel = compiled(fastmath=_FAST_MATH, error_model="numpy")
 # Small functions are inlined, because a call copies the descriptions of all arrays of a scene.
 inlined_kernel = compiled(fastmath=_FAST_MATH, error_model="numpy", forceinline=True)
 
-_MASK = 0xFFFFFFFF
-_TO_UNIT = 1.0 / 4294967296.0
-_MAX_OCTAVES = 12
+_UINT32_MASK = 0xFFFFFFFF
+_HASH_TO_UNIT_SCALE = 1.0 / 4294967296.0
+_MAX_OCTAVE_COUNT = 12
 
 
 @inlined_kernel
 def hash_unit(x, y, z, seed):
     """Return a number in [0, 1) that depends on four integers."""
-    h = (x * 374761393 + y * 668265263 + z * 2147483647 + seed * 1274126177) & _MASK
-    h = ((h ^ (h >> 15)) * 2246822519) & _MASK
-    h = ((h ^ (h >> 13)) * 3266489917) & _MASK
-    return (h ^ (h >> 16)) * _TO_UNIT
+    h = (x * 374761393 + y * 668265263 + z * 2147483647 + seed * 1274126177) & _UINT32_MASK
+    h = ((h ^ (h >> 15)) * 2246822519) & _UINT32_MASK
+    h = ((h ^ (h >> 13)) * 3266489917) & _UINT32_MASK
+    return (h ^ (h >> 16)) * _HASH_TO_UNIT_SCALE
 
 
 @inlined_kernel
@@ -67,7 +67,7 @@ def visible_share(wavelength, footprint):
 def fractal2(x, y, wavelength, gain, footprint, seed):
     """Sum octaves of plane noise from a wavelength down to the footprint, each `gain` times as strong as the last."""
     total, amplitude = 0.0, 1.0
-    for octave in range(_MAX_OCTAVES):
+    for octave in range(_MAX_OCTAVE_COUNT):
         if wavelength <= footprint:
             break
         scale = 1.0 / wavelength
@@ -81,7 +81,7 @@ def fractal2(x, y, wavelength, gain, footprint, seed):
 def fractal3(x, y, z, wavelength, gain, footprint, seed):
     """Sum octaves of space noise, as `fractal2` does in the plane."""
     total, amplitude = 0.0, 1.0
-    for octave in range(_MAX_OCTAVES):
+    for octave in range(_MAX_OCTAVE_COUNT):
         if wavelength <= footprint:
             break
         s = 1.0 / wavelength

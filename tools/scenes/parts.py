@@ -69,8 +69,8 @@ def add_books(place: Frame, width: float, covers: Sequence[int], tallest: float 
         z += thickness
 
 
-def book_covers(builder: SceneBuilder) -> list[int]:
-    """Add the materials of printed book covers."""
+def add_cover_materials(builder: SceneBuilder) -> list[int]:
+    """Add the materials of printed book covers and return their numbers."""
     colors = [
         ((0.36, 0.05, 0.04), (0.85, 0.76, 0.5)),
         ((0.04, 0.09, 0.25), (0.8, 0.8, 0.75)),
@@ -91,11 +91,11 @@ def book_covers(builder: SceneBuilder) -> list[int]:
     return covers + [builder.material(textures.PICTURE, (0, 0, 0), scale=(0.1, 1), contrast=0.5, varied=True)]
 
 
-def foliage(builder: SceneBuilder, leaf: float) -> list[int]:
-    """Add three greens, with leaves of a size in metres."""
+def add_foliage_materials(builder: SceneBuilder, leaf_metres: float) -> list[int]:
+    """Add the materials of three greens, with leaves of a size, and return their numbers."""
     greens = [
         ((0.025, 0.055, 0.010), (0.16, 0.24, 0.04)),
         ((0.030, 0.070, 0.018), (0.12, 0.22, 0.06)),
         ((0.045, 0.065, 0.012), (0.24, 0.27, 0.06)),
     ]
-    return [builder.material(textures.FOLIAGE, *pair, scale=(leaf, 1), contrast=0.55) for pair in greens]
+    return [builder.material(textures.FOLIAGE, *pair, scale=(leaf_metres, 1), contrast=0.55) for pair in greens]

@@ -21,8 +21,8 @@ from tools.scenes.sky import evaluate_sky
 
 _ROWS_PER_TASK = 16
 _FOOTPRINT_SUBSAMPLES = 1.4  # side of the square that a subsample averages, in distances of subsamples
-_GAMMA = 1 / 2.2
-_CONTRAST = 0.55
+_DISPLAY_GAMMA = 1 / 2.2
+_TONE_CONTRAST = 0.55
 
 
 class CameraArrays(NamedTuple):
@@ -39,7 +39,7 @@ class CameraArrays(NamedTuple):
     intrinsics: np.ndarray
 
 
-def camera_arrays(camera: Camera) -> CameraArrays:
+def make_camera_arrays(camera: Camera) -> CameraArrays:
     """Convert a camera for compiled code."""
     return CameraArrays(
         np.ascontiguousarray(camera.rotation.T),
@@ -80,8 +80,8 @@ def _cast_corner(scene, camera, column, row):
 @kernel
 def _develop(light):
     """Apply the rest of the tone curve to light in [0, 1]: gamma and some contrast."""
-    shown = light**_GAMMA
-    return shown + _CONTRAST * (shown * shown * (3.0 - 2.0 * shown) - shown)
+    shown = light**_DISPLAY_GAMMA
+    return shown + _TONE_CONTRAST * (shown * shown * (3.0 - 2.0 * shown) - shown)
 
 
 @kernel
@@ -177,7 +177,7 @@ def _find_visible(scene, position, points, visible):
 def render_picture(scene: SceneArrays, camera: Camera, exposure: float) -> np.ndarray:
     """Return the (H, W, 3) float32 picture in [0, 1], display-referred, without the sensor's noise."""
     picture = np.empty((camera.height, camera.width, 3), np.float32)
-    arrays = camera_arrays(camera)
+    arrays = make_camera_arrays(camera)
 
     def render(first: int, last: int) -> None:
         _render_rows(scene, arrays, first, last, exposure, picture)
@@ -194,7 +194,7 @@ def render_depth(scene: SceneArrays, camera: Camera) -> np.ndarray:
         camera: any pinhole camera outside all primitives.
     """
     depth = np.empty((camera.height, camera.width), np.float32)
-    arrays = camera_arrays(camera)
+    arrays = make_camera_arrays(camera)
 
     def render(first: int, last: int) -> None:
         _depth_rows(scene, arrays, first, last, depth)
@@ -209,7 +209,7 @@ def cast_pixels(scene: SceneArrays, camera: Camera, pixels: np.ndarray) -> tuple
     In the sky, the depth is infinite and the primitive -1.
     """
     hits = np.zeros((len(pixels), 5))
-    _cast_pixels(scene, camera_arrays(camera), np.ascontiguousarray(pixels, np.float64), hits)
+    _cast_pixels(scene, make_camera_arrays(camera), np.ascontiguousarray(pixels, np.float64), hits)
     return hits[:, 0], hits[:, 1].astype(np.int64), hits[:, 2:]
 
 

@@ -10,7 +10,7 @@ from tools.scenes.noise import clamp_unit, fractal2, kernel
 SUN_DIRECTION, SUN_COLOR, HORIZON_COLOR, ZENITH_COLOR, GROUND_COLOR = 0, 3, 6, 9, 12
 SUN_RADIUS, CLOUD_SHARE, SKY_SEED = 15, 16, 17  # the radius is in radians
 SKY_COLUMN_COUNT = 18
-_CLOUD_FOOTPRINT = 0.004
+_CLOUD_FOOTPRINT_RATIO = 0.004
 
 
 @kernel
@@ -29,7 +29,7 @@ def evaluate_sky(sky, dx, dy, dz, has_disc):
     blue = sky[ZENITH_COLOR + 2] + (sky[HORIZON_COLOR + 2] - sky[ZENITH_COLOR + 2]) * haze
     seed = int(sky[SKY_SEED])
     x, y = dx / (dz + 0.18), dy / (dz + 0.18)  # clouds lie on a plane overhead
-    thickness = fractal2(x, y, 1.3, 0.55, _CLOUD_FOOTPRINT, seed)
+    thickness = fractal2(x, y, 1.3, 0.55, _CLOUD_FOOTPRINT_RATIO, seed)
     density = clamp_unit((thickness + sky[CLOUD_SHARE]) * 1.6) * clamp_unit(dz * 9.0)
     shade = 0.86 - 0.22 * clamp_unit(thickness) + 0.1 * fractal2(x, y, 0.5, 0.6, 0.02, seed + 50)
     red += (1.02 * shade - red) * density

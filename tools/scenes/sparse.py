@@ -19,7 +19,7 @@ from tools.scenes.render import cast_pixels, find_visible
 MIN_TRACK_LENGTH = 3
 MAX_VIEW_ANGLE_DEGREES = 45.0
 OBSERVATION_NOISE_PIXELS = 0.5
-_GRID_CELLS = 420  # at most one new point comes from each cell of a photo
+_CELLS_PER_PHOTO = 420  # At most one new point comes from each cell.
 _MIN_CELL_PIXELS = 4
 _MIN_CORNER_SCORE = 1e-5  # smaller eigenvalue of the structure tensor of a picture in [0, 1]
 _BORDER_PIXELS = 3
@@ -71,7 +71,7 @@ def find_corners(photo: np.ndarray) -> Corners:
     border = np.ones_like(score, bool)
     border[_BORDER_PIXELS:-_BORDER_PIXELS, _BORDER_PIXELS:-_BORDER_PIXELS] = False
     score[border] = 0
-    cell = max(_MIN_CELL_PIXELS, round((width * height / _GRID_CELLS) ** 0.5))
+    cell = max(_MIN_CELL_PIXELS, round((width * height / _CELLS_PER_PHOTO) ** 0.5))
     positions = []
     for top in range(0, height, cell):
         for left in range(0, width, cell):
@@ -87,20 +87,23 @@ def make_sparse_points(
     scene: SceneArrays, cameras: list[Camera], corners: list[Corners], rng: np.random.Generator
 ) -> SparsePoints:
     """Make points at the corners of all photos, observe them with noise and triangulate them."""
-    parts = [_surface_points(scene, camera, found) for camera, found in zip(cameras, corners, strict=True)]
+    parts = [
+        _find_surface_points(scene, camera, photo_corners)
+        for camera, photo_corners in zip(cameras, corners, strict=True)
+    ]
     exact = np.concatenate([part[0] for part in parts])
     normals = np.concatenate([part[1] for part in parts])
     colors = np.concatenate([part[2] for part in parts])
     source = np.repeat(np.arange(len(cameras)), [len(part[0]) for part in parts])
     observations = [_observe(scene, cameras, number, exact, normals, source, rng) for number in range(len(cameras))]
-    point = np.concatenate([seen for seen, _ in observations])
-    photo = np.repeat(np.arange(len(cameras)), [len(seen) for seen, _ in observations])
-    pixels = np.concatenate([places for _, places in observations])
+    point = np.concatenate([rows for rows, _ in observations])
+    photo = np.repeat(np.arange(len(cameras)), [len(rows) for rows, _ in observations])
+    pixels = np.concatenate([positions for _, positions in observations])
     order = np.lexsort((photo, point))
     point, photo, pixels = point[order], photo[order], pixels[order]
     count = np.bincount(point, minlength=len(exact))
-    directions = _directions(cameras, photo, exact[point])
-    start = _directions(cameras, source, exact)[point]
+    directions = _compute_directions(cameras, photo, exact[point])
+    start = _compute_directions(cameras, source, exact)[point]
     angle = np.zeros(len(exact))
     np.maximum.at(angle, point, np.degrees(np.arccos(np.clip((directions * start).sum(axis=1), -1, 1))))
     keep = (count >= MIN_TRACK_LENGTH) & (angle > _MIN_TRIANGULATION_ANGLE_DEGREES)
@@ -111,7 +114,9 @@ def make_sparse_points(
     return SparsePoints(positions[keep], colors[keep], errors[keep], new_number[point[kept]], photo[kept], pixels[kept])
 
 
-def _surface_points(scene: SceneArrays, camera: Camera, corners: Corners) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _find_surface_points(
+    scene: SceneArrays, camera: Camera, corners: Corners
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return surface points, normals and colours of those corners that lie on one smooth surface."""
     depth, primitive, normals = cast_pixels(scene, camera, corners.positions)
     keep = primitive >= 0
@@ -160,7 +165,8 @@ def _observe(
     return rows, pixels[rows] + rng.normal(size=(len(rows), 2)) * OBSERVATION_NOISE_PIXELS
 
 
-def _directions(cameras: list[Camera], photo: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _compute_directions(cameras: list[Camera], photo: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the unit vectors (N, 3) from points to the cameras of photos."""
     offset = np.array([camera.position for camera in cameras])[photo] - points
     return offset / np.linalg.norm(offset, axis=1, keepdims=True)
 
