@@ -1,3 +1,5 @@
+"""tools/studies/set_variants.py: sets with few photos, or with photos in two groups of exposure."""
+
 from __future__ import annotations
 
 from dataclasses import replace
