@@ -275,6 +275,24 @@ def test_both_readers_refuse_the_same_values_of_metadata(path):
     assert refused > len(WRONG_VALUES) / 2
 
 
+@pytest.mark.parametrize("depth", [62, 63, 950, 100_000])
+def test_both_readers_have_the_same_limit_for_the_nesting_of_metadata(depth):
+    """The metadata and its provenance are two of at most 64 levels."""
+    sections = list(read_container(encode(random_model(3), "raw")).sections)
+    metadata = json.loads(bytes(sections[0].data)) | {"provenance": {"a": None}}
+    changed = json.dumps(metadata).replace('{"a": null}', '{"a": ' + "[" * depth + "]" * depth + "}").encode()
+    meta = replace(sections[0], data=changed, raw_length=len(changed))
+    data = write_container([meta, *sections[1:]], minor=MINOR_VERSION)
+
+    if depth == 62:
+        assert_same_bits(data)
+        return
+    with pytest.raises(ValueError, match="too deep"):
+        minimal_reader.read(data)
+    with pytest.raises(HyrfFormatError):
+        decode_model(data)
+
+
 def test_a_file_without_metadata_or_names_is_refused():
     empty = write_container([], minor=0)
 

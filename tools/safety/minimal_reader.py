@@ -64,8 +64,8 @@ def read(
 
     Args:
         data: the bytes of a file.
-        folder: the bytes of other files of its folder by name, which its sections may refer to (2.12).
         part: whether `data` may be the start of a file; incomplete layers, and all layers after them, are left out.
+        folder: the bytes of other files of its folder by name, which its sections may refer to (2.12).
 
     Returns:
         The metadata; the eight groups of section 2 and the residuals, if there are any, by the type of their first
@@ -81,7 +81,7 @@ def read(
     if shared := follow_references(sections, folder or {}):
         metadata["provenance"] = read_metadata(shared["META"])["provenance"] | metadata["provenance"]
     config, layers = metadata["config"], metadata.get("layers") or [metadata["gaussians"]]
-    shapes = matrix_shapes(config, layers)
+    shapes = list_matrix_shapes(config, layers)
     for (group, layer), (rows, columns) in shapes.items():
         name = section_type(group, layer)
         require(name in sections, f"{name}: the section is missing")
@@ -120,7 +120,7 @@ def read(
         elif codec == 11:
             numbers = read_numbers(source, stated_groups(source, config["geometry" if group == "GTAB" else "radiance"]))
         elif group in ("GMLP", "RMLP"):
-            numbers = read_numbers(source, decoder_groups(decoder_layers(config, group)))
+            numbers = read_numbers(source, decoder_groups(list_decoder_layers(config, group)))
         else:
             require(0 in points, f"{group}: codec 8 without lattice points")
             grid = config["geometry" if group == "GTAB" else "radiance"]
@@ -142,7 +142,7 @@ def read_parts(data: bytes) -> list[tuple[str, Any]]:
     require("PRTS" in sections, "this is no merged file")
     names = sections["PRTS"]
     require(names.codec == 0 and names.raw_length == names.stored_length <= 2**16, "PRTS: unknown codec or size")
-    content = json.loads(names.read().decode("utf-8"))
+    content = parse_json(names.read())
     require(isinstance(content, dict) and "names" in content, "PRTS: no object with names")
     listed = content["names"]
     require(isinstance(listed, list) and 1 <= len(listed) <= 64, "PRTS: not 1 to 64 names")
@@ -326,7 +326,7 @@ def read_metadata(section: Section) -> dict[str, Any]:
         text = inflate.decompress(text, section.raw_length + 1)
         require(inflate.eof and not inflate.unused_data, "META: bad deflate stream")
     require(len(text) == section.raw_length, "META: wrong raw length")
-    metadata = json.loads(text.decode("utf-8"))
+    metadata = parse_json(text)
     require(isinstance(metadata, dict) and nesting_depth(metadata) <= 64, "META: not an object or too deep")
     require(all(map(math.isfinite, list_floats(metadata))), "META: NaN or infinity")
     require(METADATA_KEYS <= metadata.keys(), "META: a key is missing")
@@ -369,6 +369,13 @@ def read_metadata(section: Section) -> dict[str, Any]:
     return metadata
 
 
+def parse_json(text: bytes) -> Any:
+    try:
+        return json.loads(text.decode("utf-8"))
+    except RecursionError:  # Python's parser calls itself for each level of nesting
+        raise ValueError("JSON: too deep") from None
+
+
 def check_keys(value: Any, keys: set[str], *optional: str) -> None:
     require(isinstance(value, dict) and set(value) - {*optional} == keys, "META: unknown or missing keys in config")
 
@@ -380,8 +387,12 @@ def check_numbers(value: Any, count: int) -> None:
 
 
 def nesting_depth(value: Any) -> int:
-    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
-    return 0 if inner is None else 1 + max(map(nesting_depth, inner), default=0)
+    """Return how deep lists and objects are nested; 0 for a number or a text."""
+    depth, values = 0, [value]
+    while containers := [item for item in values if isinstance(item, (dict, list))]:
+        values = [item for outer in containers for item in (outer.values() if isinstance(outer, dict) else outer)]
+        depth += 1
+    return depth
 
 
 def list_floats(value: Any) -> list[float]:
@@ -394,7 +405,7 @@ def check_integer(value: Any, low: int, high: int) -> int:
     return value
 
 
-def matrix_shapes(config: dict[str, Any], layers: list[int]) -> dict[tuple[str, int], tuple[int, int]]:
+def list_matrix_shapes(config: dict[str, Any], layers: list[int]) -> dict[tuple[str, int], tuple[int, int]]:
     """Return the rows and columns of each (group, layer); field groups have layer 0 only (2)."""
     shapes = {}
     columns_by_group = dict(zip(LAYERED_GROUPS, (3, 3, 1, 1), strict=True))
@@ -403,20 +414,20 @@ def matrix_shapes(config: dict[str, Any], layers: list[int]) -> dict[tuple[str, 
     for layer, n in enumerate(layers):
         shapes |= {(group, layer): (n, columns) for group, columns in columns_by_group.items()}
     for name, grid in (("GTAB", config["geometry"]), ("RTAB", config["radiance"])):
-        shapes[name, 0] = (sum(rows for _, rows in grid_levels(grid)), 2)
+        shapes[name, 0] = (sum(rows for _, rows in list_grid_levels(grid)), 2)
     for name in ("GMLP", "RMLP"):
-        shapes[name, 0] = (sum(outputs * (inputs + 1) for inputs, outputs in decoder_layers(config, name)), 1)
+        shapes[name, 0] = (sum(outputs * (inputs + 1) for inputs, outputs in list_decoder_layers(config, name)), 1)
     return shapes
 
 
-def grid_levels(grid: dict[str, int]) -> list[tuple[int, int]]:
+def list_grid_levels(grid: dict[str, int]) -> list[tuple[int, int]]:
     """Return (vertices per axis, rows) of each level of a hash grid (2.3)."""
     growth = (grid["finest"] / grid["base"]) ** (1 / max(grid["levels"] - 1, 1))
     vertices = [math.ceil(grid["base"] * growth**level - 1e-6) for level in range(grid["levels"])]
     return [(r, min(r**3, 2 ** grid["log2_table_size"])) for r in vertices]
 
 
-def decoder_layers(config: dict[str, Any], name: str) -> list[tuple[int, int]]:
+def list_decoder_layers(config: dict[str, Any], name: str) -> list[tuple[int, int]]:
     """Return (inputs, outputs) of the three layers of a decoder (2.4)."""
     if name == "GMLP":
         inputs, outputs = 2 * config["geometry"]["levels"], 8
@@ -669,7 +680,7 @@ def decoder_groups(layers: list[tuple[int, int]]) -> tuple[np.ndarray, int]:
 
 def stated_groups(source: Cursor, grid: dict[str, int]) -> tuple[np.ndarray, int]:
     """Read the groups of a table's numbers (3.6)."""
-    rows = [rows for _, rows in grid_levels(grid)]
+    rows = [rows for _, rows in list_grid_levels(grid)]
     levels = np.repeat(np.arange(len(rows)), rows)
     uses = read_integers(source.take(source.unpack("I")[0]), levels)
     require(bool((uses < 16).all()), "codec 11: usage class out of range")
@@ -679,7 +690,7 @@ def stated_groups(source: Cursor, grid: dict[str, int]) -> tuple[np.ndarray, int
 def table_groups(grid: dict[str, int], m: np.ndarray) -> np.ndarray:
     """Return the group of each row of a hash table, which is 16 level + u (3.5)."""
     groups, m = [], m[:: max(1, -(-len(m) // 65536))]
-    for level, (r, rows) in enumerate(grid_levels(grid)):
+    for level, (r, rows) in enumerate(list_grid_levels(grid)):
         cells, use = m * (r - 1) // 2**19, np.zeros(rows, np.int64)
         for corner in np.ndindex(2, 2, 2):
             x, y, z = (cells + corner).T
