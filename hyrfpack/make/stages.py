@@ -18,6 +18,7 @@ from hyrfpack.compress import compress_model
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.config.export import ExportConfig
 from hyrfpack.config.poses import PosesConfig
+from hyrfpack.config.train import TrainConfig
 from hyrfpack.context import RunContext
 from hyrfpack.copying import copy_file
 from hyrfpack.counts import format_count
@@ -132,39 +133,71 @@ def run_training_stage(
             resume = resuming and is_begun(run)
             if not resume:
                 remove_preview(stage_cache)  # it shows other photos or settings
-            progress = _TrainingProgress(stage_cache.reporter).report_event
-            trainers: list[Trainer] = []
-
-            def observe(trainer: Trainer) -> None:
-                # A finished trainer is not kept, so that its memory is free while results are written.
-                # No preview is written of a pilot run, which is short and lacks the validation photos.
-                is_main_run = trainer.kind != "pilot run"
-                trainers[:] = [trainer] if is_main_run and trainer.step < trainer.steps else []
-                if observer is not None:
-                    observer(trainer)
-
-            try:
-                trained = train_model(
-                    scene, run, config, resume=resume, overwrite=True, observer=observe,
-                    context=replace(context, progress=progress),
-                )  # fmt: skip
-            except HyrfError as error:  # the fix of this error refers to the command `train`
-                plain = error.__cause__ if isinstance(error.__cause__, HyrfError) else error
-                if resume and not trainers and isinstance(plain, HyrfTrainingError):  # the checkpoint cannot be used
-                    plain = plain.with_text(fix=f"delete {run} and run the same command again")
-                raise plain from None
-            if not trained.complete:
-                raise Stopped("training", write_preview(stage_cache, trainers[-1], context) if trainers else None)
-            if not (run / METRICS_FILE).is_file():  # the disk was full; the next call writes them
-                raise HyrfError(trained.missing, fix="run the same command again, which writes what is missing")
-        metrics = json.loads((run / METRICS_FILE).read_bytes())
-        facts = {key: metrics[key] for key in ("gaussians", "bytes", "choices", "device")}
-        provenance = describe_file(run / MODEL_FILE)["provenance"]
-        facts |= {name: provenance[name] for name in ("steps", "psnr")}
-        facts["target_bytes"] = config.target_bytes
-        return facts, [f"{RUN_FOLDER}/{name}" for name in (MODEL_FILE, METRICS_FILE)]
+            _train(stage_cache, scene, config, resume, observer, context)
+        return _read_training_facts(run, config), [f"{RUN_FOLDER}/{name}" for name in (MODEL_FILE, METRICS_FILE)]
 
     return stage_cache.run_stage("training", inputs, execute, {name: getattr(config, name) for name in FIXED_SETTINGS})
+
+
+def _train(
+    stage_cache: StageCache,
+    scene: Scene,
+    config: TrainConfig,
+    resume: bool,
+    observer: Callable[[Trainer], None] | None,
+    context: RunContext,
+) -> None:
+    """Train a model into `run/`. An interrupted main run leaves a preview of the scene beside its checkpoint.
+
+    Args:
+        stage_cache: the stages of the pipeline.
+        scene: the photos.
+        config: settings of the training.
+        resume: resume the run that is in `run/`.
+        observer: observer of the training, besides that of the preview.
+        context: context of the call.
+
+    Raises:
+        Stopped: the training was interrupted.
+        HyrfError: it failed, or some of its results could not be written.
+    """
+    run = stage_cache.folder / RUN_FOLDER
+    unfinished: list[Trainer] = []  # the trainer of the main run until its last step
+
+    def observe(trainer: Trainer) -> None:
+        # A finished trainer is not kept, so that its memory is free while results are written.
+        # No preview is written of a pilot run, which is short and lacks the validation photos.
+        is_main_run = trainer.kind != "pilot run"
+        unfinished[:] = [trainer] if is_main_run and trainer.step < trainer.steps else []
+        if observer is not None:
+            observer(trainer)
+
+    progress = _TrainingProgress(stage_cache.reporter).report_event
+    try:
+        trained = train_model(
+            scene, run, config, resume=resume, overwrite=True, observer=observe,
+            context=replace(context, progress=progress),
+        )  # fmt: skip
+    except HyrfError as error:  # the fix of this error refers to the command `train`
+        plain = error.__cause__ if isinstance(error.__cause__, HyrfError) else error
+        if resume and not unfinished and isinstance(plain, HyrfTrainingError):  # the checkpoint cannot be used
+            plain = plain.with_text(fix=f"delete {run} and run the same command again")
+        raise plain from None
+    if not trained.complete:
+        raise Stopped("training", write_preview(stage_cache, unfinished[-1], context) if unfinished else None)
+    if not (run / METRICS_FILE).is_file():  # the disk was full; the next call writes them
+        raise HyrfError(trained.missing, fix="run the same command again, which writes what is missing")
+
+
+def _read_training_facts(run: Path, config: TrainConfig) -> dict[str, Any]:
+    """Return the facts of a finished training run: its Gaussians, bytes, decisions, device, steps, PSNR and target."""
+    metrics = json.loads((run / METRICS_FILE).read_bytes())
+    provenance = describe_file(run / MODEL_FILE)["provenance"]
+    return {
+        **{name: metrics[name] for name in ("gaussians", "bytes", "choices", "device")},
+        **{name: provenance[name] for name in ("steps", "psnr")},
+        "target_bytes": config.target_bytes,
+    }
 
 
 def trained_target_bytes(stage_cache: StageCache) -> int | None:
