@@ -1,5 +1,7 @@
 """Render pictures of a `.hyrf` file along an orbit. It needs torch, numpy and Pillow, and loads no training code.
 
+A merged file of several models is rendered whole.
+
 python examples/read_and_render.py bonsai.hyrf frames --frames 24
 """
 
@@ -22,7 +24,7 @@ def main() -> None:
     args = parser.parse_args()
 
     cameras = orbit(Capture(hyrfpack.describe_file(args.model)).viewpoint, args.frames)
-    model = hyrfpack.load_model(args.model)
+    model = hyrfpack.load_merged_model(args.model)  # a file of one model is read as a merged model of one part
     args.out.mkdir(parents=True, exist_ok=True)
     with torch.no_grad():
         decoded = model.decode()  # the geometry does not depend on the view, so it is decoded once for all frames

@@ -10,6 +10,7 @@ import pytest
 from explicit_balls import ball_splats
 from PIL import Image
 
+import hyrfpack
 from hyrfpack.format import describe_file
 from hyrfpack.splats.formats import ply
 
@@ -34,6 +35,11 @@ def test_the_example_scripts_train_compress_render_and_import(folder, data, monk
     said = run("read_and_render.py", "run/small.hyrf", "frames", "--frames", 2)
     assert said.startswith("frames: 2 pictures of ")
     assert [Image.open(folder / "frames" / f"{number:04d}.png").size for number in (0, 1)] == [(48, 48)] * 2
+
+    hyrfpack.merge_models(["run/small.hyrf", "run/model.hyrf"], "merged.hyrf")
+    said = run("read_and_render.py", "merged.hyrf", "merged_frames", "--frames", 1)
+    count = sum(describe_file(f"run/{name}.hyrf")["gaussians"] for name in ("small", "model"))
+    assert said == f"merged_frames: 1 pictures of {count:,} Gaussians\n"
 
     (folder / "scene.ply").write_bytes(ply.encode(ball_splats(40)))
     files = ("scene.ply", "scene.hyrf", "compare.png")
