@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from contextlib import suppress
 from pathlib import Path
 
 from hyrfpack.atomic import write_atomic
@@ -47,7 +48,7 @@ def auto_pose(
 
     Raises:
         HyrfError: the folder may not or cannot be written, is in use by another call, holds a run, or holds poses of
-            other photos; or the poses cannot be estimated.
+            other or unknown photos; or the poses cannot be estimated.
         KeyboardInterrupt: the estimation was interrupted; the same call resumes it.
     """
     scene, source = run / SCENE_FOLDER, Source.from_path(photos, LoadSettings(images))
@@ -72,21 +73,62 @@ def _estimate_unless_posed(source: Source, scene: Path, overwrite: bool, context
     """Estimate poses and write them into the folder of a scene, unless it has poses and `overwrite` is not set.
 
     Raises:
-        HyrfError: the poses there are of other photos, or the poses cannot be estimated.
+        HyrfError: the poses there are of other or unknown photos, or the poses cannot be estimated.
     """
     from hyrfpack.poses import estimate_poses
 
-    digest, record = files_digest(source.files(), source.path), scene / SOURCE_DIGEST_NAME
-    if is_posed(scene) and not overwrite:
-        if record.is_file() and record.read_text() != digest:
-            raise HyrfError(
-                f"{scene}: these poses were estimated from other photos, or the photos have changed",
-                fix="choose another folder, or estimate them again with `overwrite=True`",
-            )
+    digest, record = files_digest(source.files(), source.path).encode(), scene / SOURCE_DIGEST_NAME
+    was_posed = is_posed(scene)
+    if was_posed and not overwrite:
+        _check_source_digest(scene, digest)
         _LOG.info(
             f"reusing the poses in {scene}, which an earlier call estimated; `overwrite=True` estimates them again"
         )
         return
+    # The process may be killed at any time, and finished poses must never lie beside the digest of other photos. New
+    # poses therefore find their digest in place, and poses that are replaced lose theirs first.
+    replaced_digest = _read_source_digest(scene) if was_posed else None
     with interruptible():
-        estimate_poses(source.path, scene, overwrite=overwrite, context=context)
-        write_atomic(record, digest.encode())
+        if was_posed:
+            record.unlink(missing_ok=True)
+        else:
+            write_atomic(record, digest)
+        try:
+            estimate_poses(source.path, scene, overwrite=overwrite, context=context)
+        except HyrfError:
+            if replaced_digest is not None and is_posed(scene):  # the old poses are still in place
+                write_atomic(record, replaced_digest)
+            elif not was_posed:
+                with suppress(OSError):  # the folder stays if it holds other files
+                    record.unlink(missing_ok=True)
+                    scene.rmdir()
+            raise
+        if was_posed:
+            write_atomic(record, digest)
+
+
+def _read_source_digest(scene: Path) -> bytes | None:
+    """Return the digest of the photos from which the poses of a scene were estimated; None if it cannot be read."""
+    try:
+        return (scene / SOURCE_DIGEST_NAME).read_bytes()
+    except OSError:
+        return None
+
+
+def _check_source_digest(scene: Path, digest: bytes) -> None:
+    """Check that the poses of a scene were estimated from the photos with this digest.
+
+    Raises:
+        HyrfError: they were not, or it is not known.
+    """
+    recorded = _read_source_digest(scene)
+    if recorded is None:
+        raise HyrfError(
+            f"{scene}: there are poses, but no record ({SOURCE_DIGEST_NAME}) of the photos that they belong to",
+            fix="train on this folder, or estimate the poses again with `overwrite=True`",
+        )
+    if recorded != digest:
+        raise HyrfError(
+            f"{scene}: these poses were estimated from other photos, or the photos have changed",
+            fix="choose another folder, or estimate them again with `overwrite=True`",
+        )
