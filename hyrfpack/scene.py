@@ -18,8 +18,15 @@ Item = TypeVar("Item")
 RIGID_TOLERANCE = 1e-3
 # Photos whose longer side has more pixels are shrunk to this length, as in 3DGS.
 DEFAULT_MAX_SIZE = 1600
+MIN_MAX_SIZE = 16  # shrunk further, photos show too little to train on; SSIM alone compares windows of 11 pixels
+
 # Poses and sizes are float32 in files and pictures. Its range is wider, as cameras may stand far outside of a scene.
 MAX_WORLD_COORDINATE = 1e30
+
+
+def is_max_size(value: int) -> bool:
+    """Return whether photos can be shrunk to this many pixels on the longer side; 0 keeps their size."""
+    return value == 0 or value >= MIN_MAX_SIZE
 
 
 def rigid_pose(values: object) -> np.ndarray:

@@ -22,7 +22,7 @@ from hyrfpack.cameras.sampling import (
 )
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.rotations import IDENTITY
-from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced
+from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced, is_max_size
 
 MAX_STORED_CAMERAS = MAX_SAMPLING_CAMERAS
 MIN_COARSE_CAMERAS = 14
@@ -252,7 +252,7 @@ class Capture:
         It is DEFAULT_MAX_SIZE if the file does not state a valid one.
         """
         stored = self.facts["provenance"].get("max_size")
-        usable = isinstance(stored, int) and not isinstance(stored, bool) and stored >= 0
+        usable = isinstance(stored, int) and not isinstance(stored, bool) and is_max_size(stored)
         return stored if usable else DEFAULT_MAX_SIZE
 
     @property

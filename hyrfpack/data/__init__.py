@@ -14,9 +14,9 @@ from hyrfpack.data.folder import explain_missing_path, list_photos, list_raw_pho
 from hyrfpack.data.layouts import LAYOUTS
 from hyrfpack.data.search import find_only_subfolder
 from hyrfpack.data.unusable import no_photos_error, raise_if_single_photo
-from hyrfpack.errors import HyrfDataError, HyrfNoPosesError, suggest_command
+from hyrfpack.errors import HyrfDataError, HyrfError, HyrfNoPosesError, suggest_command
 from hyrfpack.outputs import VIDEO_SUFFIXES
-from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
+from hyrfpack.scene import DEFAULT_MAX_SIZE, MIN_MAX_SIZE, Scene, is_max_size
 
 __all__ = ["LAYOUTS", "PictureCache", "load_scene", "pose_commands"]
 
@@ -49,7 +49,8 @@ def load_scene(
         model: name of the folder of a COLMAP model ("1" for `sparse/1`). None takes the model with the most photos;
             `Scene.notes` names it if there are several.
         max_size: shrink photos whose longer side has more pixels to this length when they are decoded; cameras and
-            masks are scaled with them. 0 keeps the stored size. `Scene.notes` states how many photos are shrunk.
+            masks are scaled with them. 0 keeps the stored size; other values are at least 16. `Scene.notes` states how
+            many photos are shrunk.
         held_out: names of the views to hold out, instead of `test_every` and of the dataset's own split.
 
     Returns:
@@ -59,6 +60,7 @@ def load_scene(
         HyrfNoPosesError: the path holds photos, or is a video, and there are no poses.
         HyrfDataError: the folder cannot be used, or `held_out` names an unknown photo or all photos. The message says
             what is wrong, where, and what to do.
+        HyrfError: a `max_size` of 1 to 15 pixels.
         ValueError: an unknown `layout`, or a negative `test_every` or `max_size`.
 
     Example:
@@ -71,6 +73,11 @@ def load_scene(
         raise ValueError(f"test_every must be 0 or more, not {test_every}")
     if max_size < 0:
         raise ValueError(f"max_size must be 0 (photos as they are) or more, not {max_size}")
+    if not is_max_size(max_size):
+        raise HyrfError(
+            f"{path}: photos that are shrunk to {max_size} pixels on the longer side show too little",
+            fix=f"shrink them to {MIN_MAX_SIZE} pixels or more with `max_size`, or keep their size with `max_size=0`",
+        )
     if layout not in (None, *LAYOUTS):
         raise ValueError(f"no layout '{layout}'; there are {', '.join(LAYOUTS)}")
     given = Path(path)

@@ -10,7 +10,7 @@ from hyrfpack.counts import format_count
 from hyrfpack.data import LAYOUTS, load_scene
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE, find_model
-from hyrfpack.scene import Scene
+from hyrfpack.scene import Scene, is_max_size
 
 
 def load_training_scene(model: str | os.PathLike[str]) -> Scene | None:
@@ -66,5 +66,6 @@ def _is_reading(path: object, options: dict) -> bool:
     return (
         all(isinstance(value, kinds[name]) and not isinstance(value, bool) for name, value in options.items())
         and options["layout"] in LAYOUTS
-        and min(options["test_every"], options["max_size"]) >= 0
+        and options["test_every"] >= 0
+        and is_max_size(options["max_size"])
     )

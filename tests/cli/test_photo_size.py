@@ -75,7 +75,7 @@ def test_a_model_trained_without_a_size_limit_stores_that(data, tmp_path):
     assert describe_file(tmp_path / "model.hyrf")["provenance"]["max_size"] == 0
 
 
-@pytest.mark.parametrize("stored", [None, -1, True, 1.5, "800", [800], {}])
+@pytest.mark.parametrize("stored", [None, -1, 5, True, 1.5, "800", [800], {}])
 def test_an_invalid_stored_size_is_ignored(stored):
     assert Capture({"provenance": {"max_size": stored}}).max_size == 1600
     assert Capture({"provenance": {"max_size": 0}}).max_size == 0

@@ -8,7 +8,7 @@ from PIL import Image
 
 from hyrfpack.data import load_scene
 from hyrfpack.data.pictures import fit_size, read_mask, read_pixels
-from hyrfpack.errors import HyrfDataError
+from hyrfpack.errors import HyrfDataError, HyrfError
 
 NOISE_PICTURE = np.random.default_rng(0).integers(0, 256, (24, 32, 3), dtype=np.uint8)
 
@@ -204,3 +204,9 @@ def test_a_photo_replaced_by_one_of_another_size_is_rejected(tmp_path, colmap_fo
 def test_a_negative_limit_is_rejected(tmp_path):
     with pytest.raises(ValueError, match="max_size must be 0"):
         load_scene(tmp_path, max_size=-1)
+
+
+@pytest.mark.parametrize("limit", [1, 5, 15])
+def test_a_limit_that_leaves_nothing_to_see_is_rejected_before_anything_is_read(tmp_path, limit):
+    with pytest.raises(HyrfError, match=f"shrunk to {limit} pixels on the longer side show too little.*16 pixels or m"):
+        load_scene(tmp_path, max_size=limit)
