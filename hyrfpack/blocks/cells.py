@@ -40,7 +40,7 @@ class Cells:
         columns, borders = self.row_borders.shape
         return columns * (borders - 1)
 
-    def name(self, cell: int) -> str:
+    def name_cell(self, cell: int) -> str:
         """Return the name of a cell, "column-row", both counted from 1."""
         column, row = divmod(cell, self.row_borders.shape[1] - 1)
         return f"{column + 1}-{row + 1}"
@@ -98,9 +98,9 @@ def divide_ground(scene: Scene, columns: int, rows: int) -> Cells:
     """
     axes = ground_axes(scene)
     footprint, weights = _weighted_footprint(scene, axes)
-    column_borders = _borders(footprint[:, 0], weights, columns)
+    column_borders = _find_borders(footprint[:, 0], weights, columns)
     column = np.searchsorted(column_borders[1:-1], footprint[:, 0], side="right")
-    row_borders = [_borders(footprint[column == c, 1], weights[column == c], rows) for c in range(columns)]
+    row_borders = [_find_borders(footprint[column == c, 1], weights[column == c], rows) for c in range(columns)]
     overlap = OVERLAP_RATIO * ground_extent(scene, axes) / (columns, rows)
     return Cells(axes, column_borders, np.stack(row_borders), overlap)
 
@@ -113,11 +113,11 @@ def _weighted_footprint(scene: Scene, axes: np.ndarray) -> tuple[np.ndarray, np.
     return places @ axes.T, weights
 
 
-def _borders(values: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
+def _find_borders(values: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
     """Return borders (count + 1,) from -inf to inf that divide weighted values into parts of equal weight."""
     if not len(values):
         return np.r_[-np.inf, np.full(count - 1, np.inf), np.inf]
     order = np.argsort(values, kind="stable")
-    reached = np.cumsum(weights[order])
-    places = np.searchsorted(reached, reached[-1] * np.arange(1, count) / count)
+    cumulative = np.cumsum(weights[order])
+    places = np.searchsorted(cumulative, cumulative[-1] * np.arange(1, count) / count)
     return np.r_[-np.inf, values[order][np.minimum(places, len(values) - 1)], np.inf]

@@ -27,30 +27,30 @@ class Block:
         name: name of its first cell.
         cells: its cells, ascending; more than one if others were merged into it.
         photos: the photos that show it.
-        used: (P,) bool, which points of the whole scene it starts from.
+        point_mask: (P,) bool, which points of the whole scene it starts from.
     """
 
     name: str
     cells: tuple[int, ...]
     photos: list[View]
-    used: np.ndarray
+    point_mask: np.ndarray
 
     @property
     def point_count(self) -> int:
         """Return the number of points that it starts from."""
-        return int(self.used.sum())
+        return int(self.point_mask.sum())
 
     def cut(self, scene: Scene) -> Scene:
         """Return the photos of the block, none of them held out, and its points, of the whole scene."""
-        new_row = np.cumsum(self.used) - 1
+        new_row = np.cumsum(self.point_mask) - 1
         rows_by_name = {view.name: scene.tracks[view.name] for view in self.photos if view.name in scene.tracks}
         return replace(
             scene,
             train=self.photos,
             test=[],
-            points=scene.points[self.used],
-            point_colors=scene.point_colors[self.used],
-            tracks={name: new_row[rows[self.used[rows]]] for name, rows in rows_by_name.items()},
+            points=scene.points[self.point_mask],
+            point_colors=scene.point_colors[self.point_mask],
+            tracks={name: new_row[rows[self.point_mask[rows]]] for name, rows in rows_by_name.items()},
             reading={},
         )
 
@@ -115,53 +115,68 @@ def plan_blocks(scene: Scene, columns: int, rows: int) -> BlockPlan:
             fix=f"use at most {max(1, len(photos) // MIN_BLOCK_PHOTOS)} blocks; each needs {MIN_BLOCK_PHOTOS} photos",
         )
     cells = divide_ground(scene, columns, rows)
-    core, seen = cells.find(scene.points), [scene.shown_points(view) for view in photos]
-    member = _assign_photos(cells, scene.points, core, photos, seen)
+    point_cells, shown_points = cells.find(scene.points), [scene.shown_points(view) for view in photos]
+    is_member = _assign_photos(cells, scene.points, point_cells, photos, shown_points)
     blocks = []
-    for group in _merge_small_groups(cells, scene.points, core, member):
-        chosen = np.flatnonzero(member[:, group].any(axis=1))
-        used = np.isin(core, group)
-        for photo in chosen:
-            used[seen[photo]] = True
-        blocks.append(Block(cells.name(group[0]), tuple(group), [photos[n] for n in chosen], used))
+    for group in _merge_small_groups(cells, scene.points, point_cells, is_member):
+        members = np.flatnonzero(is_member[:, group].any(axis=1))
+        point_mask = np.isin(point_cells, group)
+        for photo in members:
+            point_mask[shown_points[photo]] = True
+        blocks.append(Block(cells.name_cell(group[0]), tuple(group), [photos[n] for n in members], point_mask))
     return BlockPlan(cells, sorted(blocks, key=lambda block: (-len(block.photos), block.cells)))
 
 
 def _assign_photos(
-    cells: Cells, points: np.ndarray, core: np.ndarray, photos: Sequence[View], seen: Sequence[np.ndarray]
+    cells: Cells,
+    points: np.ndarray,
+    point_cells: np.ndarray,
+    photos: Sequence[View],
+    shown_points: Sequence[np.ndarray],
 ) -> np.ndarray:
-    """Return which photos belong to which cells, (photos, cells) bool."""
+    """Return which photos belong to which cells, (photos, cells) bool.
+
+    Args:
+        cells: the cells.
+        points: (P, 3) points of the scene.
+        point_cells: (P,) cell of each point.
+        photos: the training photos.
+        shown_points: indices of the points that each photo shows.
+    """
     extended = cells.find_extended(points)
-    member = np.zeros((len(photos), cells.count), bool)
+    is_member = np.zeros((len(photos), cells.count), bool)
     stands_in = cells.find(np.array([view.camera.position for view in photos]))
-    for photo, rows in enumerate(seen):
+    for photo, rows in enumerate(shown_points):
         if not len(rows):
-            member[photo, stands_in[photo]] = True
+            is_member[photo, stands_in[photo]] = True
             continue
-        member[photo] = extended[rows].mean(axis=0) >= MIN_PHOTO_SHARE
-        member[photo, np.bincount(core[rows], minlength=cells.count).argmax()] = True
-    return member
+        is_member[photo] = extended[rows].mean(axis=0) >= MIN_PHOTO_SHARE
+        is_member[photo, np.bincount(point_cells[rows], minlength=cells.count).argmax()] = True
+    return is_member
 
 
-def _merge_small_groups(cells: Cells, points: np.ndarray, core: np.ndarray, member: np.ndarray) -> list[list[int]]:
+def _merge_small_groups(
+    cells: Cells, points: np.ndarray, point_cells: np.ndarray, is_member: np.ndarray
+) -> list[list[int]]:
     """Return groups of cells that have enough photos; the smallest is merged into the nearest one until all have."""
     groups = [[cell] for cell in range(cells.count)]
     ground = points @ cells.axes.T
     while len(groups) > 1:
-        counts = [int(member[:, group].any(axis=1).sum()) for group in groups]
+        counts = [int(is_member[:, group].any(axis=1).sum()) for group in groups]
         if min(counts) >= MIN_BLOCK_PHOTOS:
             break
-        small = groups.pop(counts.index(min(counts)))
-        here = _center(cells, ground, core, small)
-        distances = [float(np.linalg.norm(_center(cells, ground, core, group) - here)) for group in groups]
+        smallest = groups.pop(counts.index(min(counts)))
+        center = _find_center(cells, ground, point_cells, smallest)
+        offsets = [_find_center(cells, ground, point_cells, group) - center for group in groups]
+        distances = [float(np.linalg.norm(offset)) for offset in offsets]
         nearest = groups[distances.index(min(distances))]
-        nearest[:] = sorted(nearest + small)
+        nearest[:] = sorted(nearest + smallest)
     return groups
 
 
-def _center(cells: Cells, ground: np.ndarray, core: np.ndarray, group: Sequence[int]) -> np.ndarray:
+def _find_center(cells: Cells, ground: np.ndarray, point_cells: np.ndarray, group: Sequence[int]) -> np.ndarray:
     """Return the centre (2,) of a group of cells on the ground: the mean of its points, or of its inner borders."""
-    inside = np.isin(core, group)
+    inside = np.isin(point_cells, group)
     if inside.any():
         return ground[inside].mean(axis=0)
     column, row = divmod(group[0], cells.row_borders.shape[1] - 1)

@@ -57,7 +57,7 @@ MAX_MEMORY_RATIO = 0.5
 POLL_SECONDS = 1.0  # A process without a block looks for one this often.
 
 
-def block_log(log: Path, block: Block) -> Path:
+def block_log_path(log: Path, block: Block) -> Path:
     """Return the path of a block's log, which has the block's name in its own."""
     return log.with_stem(f"{log.stem}-{block.name}")
 
@@ -140,7 +140,7 @@ def train_blocks(
                 if log is not None:
                     logs = Outputs(scene=scene, overwrite=resume or overwrite)
                     for block in plan.blocks:
-                        logs.file(block_log(Path(log), block))
+                        logs.file(block_log_path(Path(log), block))
                 with context.open_progress("blocks", interruptible=False) as progress:
                     check_photos(scene, cache, progress)
             return journal
@@ -173,14 +173,14 @@ def choose_grid(scene: Scene, config: TrainConfig, device: torch.device, ranks: 
     else:
         memory = memory_bytes() // ranks.local_size
     budget, _ = budget_for(scene, config)
-    needed = max(
+    needed_blocks = max(
         budget * BYTES_PER_BUDGETED_GAUSSIAN / (MAX_MEMORY_RATIO * memory), len(scene.train) / PHOTOS_PER_BLOCK
     )
-    most = max(1, min(MAX_PARTS, len(scene.train) // MIN_BLOCK_PHOTOS))
-    count = max(1, min(math.ceil(needed), most))
+    max_blocks = max(1, min(MAX_PARTS, len(scene.train) // MIN_BLOCK_PHOTOS))
+    count = max(1, min(math.ceil(needed_blocks), max_blocks))
     along, across = ground_extent(scene, ground_axes(scene)).tolist()
     rows = min(count, max(1, round(math.sqrt(count * across / along)))) if along > 0 else 1
-    while rows * math.ceil(count / rows) > most:
+    while rows * math.ceil(count / rows) > max_blocks:
         rows -= 1
     return math.ceil(count / rows), rows
 
@@ -246,7 +246,7 @@ class _BlockRun:
                 resume=resumes,
                 overwrite=not resumes,
                 observer=self.observer if self.ranks.is_main else None,
-                log=None if self.log is None else block_log(self.log, block),
+                log=None if self.log is None else block_log_path(self.log, block),
                 context=dataclasses.replace(
                     self.context, ranks=None, progress=None if is_silent else self.context.progress
                 ),

@@ -80,7 +80,7 @@ def test_cores_tile_space_and_every_photo_and_point_is_in_a_block(scene, grid, s
 def test_a_plan_is_deterministic_and_puts_the_largest_block_first(scene, grid):
     plans = [plan_blocks(scene, *grid) for _ in range(2)]
     first, second = (
-        [(block.name, block.cells, block.photos, block.used.tolist()) for block in plan.blocks] for plan in plans
+        [(block.name, block.cells, block.photos, block.point_mask.tolist()) for block in plan.blocks] for plan in plans
     )
     assert first == second
     sizes = [len(block.photos) for block in plans[0].blocks]
