@@ -215,38 +215,53 @@ def _encode_scene(
     model, parts = _read_parts(path, shared_names, config.chunk_gaussians)
     cameras = [view.camera for view in photos.train] if photos and photos.train else _list_cameras(facts)
     part_numbers = [number for number, part in enumerate(parts) for _ in part.groups]
-    encoded = [[data] for part in parts for data in part.finest]
-    models = [[part.model.subset(torch.from_numpy(group)) for part in parts for group in part.groups]]
+    refitting = part_of_progress(progress, 0.0, _REFIT_PROGRESS_SHARE)
+    encoded, models = _encode_levels(parts, part_numbers, model, cameras, config, refitting)
     boxes = [box for part in parts for box in _measure_boxes(part)]
-    for level in range(1, config.levels):
-        share = (level - 1) / max(config.levels - 1, 1)
-        stage = part_of_progress(
-            progress, _REFIT_PROGRESS_SHARE * share, _REFIT_PROGRESS_SHARE * (share + 1 / (config.levels - 1))
-        )
-        models.append([])
-        for number, coarse in enumerate(_make_level(parts, part_numbers, model, cameras, level, config, stage)):
-            encoder = parts[part_numbers[number]].encoder
-            data = encoder.encode_gaussians(coarse)
-            encoded[number].append(data)
-            models[-1].append(_decode(data, encoder))
     spheres = [(chunk.center, chunk.radius) for chunk in (Chunk(low, high, ()) for low, high in boxes)]
-    stage = part_of_progress(progress, _REFIT_PROGRESS_SHARE, _REFIT_PROGRESS_SHARE + _MEASURE_PROGRESS_SHARE)
+    measuring = part_of_progress(progress, _REFIT_PROGRESS_SHARE, _REFIT_PROGRESS_SHARE + _MEASURE_PROGRESS_SHARE)
     count = min(MEASURED_VIEWS_PER_PART * len(parts), MAX_MEASURED_VIEWS)
     views = sample_views(cameras, count, config.seed + 1)[1] if config.levels > 1 else []
     errors = measure_level_errors(
-        models, spheres, views, [part.model for part in parts], part_numbers, config.seed, stage
+        models, spheres, views, [part.model for part in parts], part_numbers, config.seed, measuring
     )
     files = {part.encoder.shared_name: part.encoder.shared_bytes for part in parts}
     chunks = []
     for number, (low, high) in enumerate(boxes):
         levels = []
-        for level, data in enumerate(encoded[number]):
+        for level, chunks_of_level in enumerate(encoded):
+            data = chunks_of_level[number]
             file = f"chunk-{number:04d}-{level}.hyrf"
             files[file] = data
             stated = tuple(float(f"{error:.4g}") for error in errors[level, number])
             levels.append(ChunkLevel(file, len(data), _checksum(data), len(models[level][number]), stated))
         chunks.append(Chunk(low, high, tuple(levels), part_numbers[number]))
     return files, _make_manifest(parts, chunks, Capture(facts, photos), name, config)
+
+
+def _encode_levels(
+    parts: Sequence[_Part],
+    part_numbers: Sequence[int],
+    finest: HybridModel | MergedModel,
+    cameras: Sequence[Camera],
+    config: SplitConfig,
+    progress: Progress,
+) -> tuple[list[list[bytes]], list[list[HybridModel]]]:
+    """Encode all chunks at all levels. The arguments are those of `_make_level`.
+
+    Returns:
+        For each level, the finest first: the bytes of each chunk, and its model as readers will decode it.
+    """
+    encoded = [[data for part in parts for data in part.finest]]
+    models = [[part.model.subset(torch.from_numpy(group)) for part in parts for group in part.groups]]
+    encoders = [parts[number].encoder for number in part_numbers]
+    coarse_count = config.levels - 1
+    for level in range(1, config.levels):
+        share = part_of_progress(progress, (level - 1) / coarse_count, level / coarse_count)
+        coarse = _make_level(parts, part_numbers, finest, cameras, level, config, share)
+        encoded.append([encoder.encode_gaussians(chunk) for encoder, chunk in zip(encoders, coarse, strict=True)])
+        models.append([_decode(data, encoder) for data, encoder in zip(encoded[-1], encoders, strict=True)])
+    return encoded, models
 
 
 def _read_parts(
@@ -369,12 +384,14 @@ def _round_outwards(low: np.ndarray, high: np.ndarray) -> tuple[tuple[float, flo
 
 
 def _checksum(data: bytes) -> str:
+    """Return the checksum of a file as a manifest states it: CRC-32 as eight hexadecimal digits."""
     return f"{zlib.crc32(data):08x}"
 
 
 def _make_manifest(
     parts: Sequence[_Part], chunks: list[Chunk], capture: Capture, name: str, config: SplitConfig
 ) -> Manifest:
+    """Return the manifest of a scene folder: its files, and the cameras and the viewpoint that readers need first."""
     values = parts[0].model.config.to_dict()
     encoders = [part.encoder for part in parts]
     shared = [(encoder.shared_name, len(encoder.shared_bytes), _checksum(encoder.shared_bytes)) for encoder in encoders]
