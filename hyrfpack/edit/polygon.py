@@ -53,8 +53,15 @@ def _parse_polygon(content: Any) -> CropPolygon:
     points = entries.get("points")
     if not isinstance(points, list) or not all(isinstance(point, list) and len(point) == 3 for point in points):
         raise ValueError("the points must be a list of [x, y, z]")
-    heights = {key: float(entries[key]) for key in _KEYS[1:] if entries.get(key) is not None}
-    return CropPolygon(tuple((float(x), float(y), float(z)) for x, y, z in points), **heights)
+    heights = {key: _parse_number(entries[key]) for key in _KEYS[1:] if entries.get(key) is not None}
+    return CropPolygon(tuple((_parse_number(x), _parse_number(y), _parse_number(z)) for x, y, z in points), **heights)
+
+
+def _parse_number(value: Any) -> float:
+    """Convert a number of a JSON file to a float; texts and true or false are no numbers."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{json.dumps(value):.40} is not a number")
+    return float(value)
 
 
 def inside_mask(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
