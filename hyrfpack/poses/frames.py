@@ -176,13 +176,12 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
     times: list[float] = []
     sharpness: list[float] = []
     thumbnails: list[np.ndarray] = []
-    notes: list[str] = []
-    decoded_count, repeated_count, time, last_measured, longest = 0, 0, 0.0, -np.inf, 0.0
-    interlaced = changes_size = False
+    decoded_count, repeated_count, time, last_measured, longest_gap = 0, 0, 0.0, -np.inf, 0.0
+    is_interlaced = changes_size = False
     for number, start, frame in video.frames():
-        longest, time = max(longest, start - time), start
+        longest_gap, time = max(longest_gap, start - time), start
         decoded_count = number + 1
-        interlaced = interlaced or bool(frame.interlaced_frame)
+        is_interlaced = is_interlaced or bool(frame.interlaced_frame)
         if time - last_measured < step * 0.98 and time > last_measured:
             continue
         last_measured = time
@@ -192,7 +191,6 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
         thumbnail = np.asarray(Image.fromarray(gray).resize(size, Image.Resampling.BOX))
         if thumbnails and thumbnails[-1].shape != thumbnail.shape:
             changes_size = True
-            notes.append(f"the picture changes its size after {time:.0f} s; the frames after that are not used")
             break
         if thumbnails and np.abs(thumbnail.astype(np.int16) - thumbnails[-1]).mean() < _MAX_REPEAT_DIFFERENCE_LEVELS:
             repeated_count += 1
@@ -209,13 +207,16 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
         if video.damaged_count:
             problem, fix = f"{problem} that can be decoded", f"copy it again in full, or {fix}"
         raise HyrfDataError(f"{path}: {problem}", fix=fix)
+    notes = []
+    if changes_size:
+        notes.append(f"the picture changes its size after {time:.0f} s; the frames after that are not used")
     # The last frame is shown for some time too, which is estimated by the longest time between two frames.
-    if video.damaged_count or (not changes_size and time + longest < _MIN_DURATION_RATIO * video.seconds):
+    if video.damaged_count or (not changes_size and time + longest_gap < _MIN_DURATION_RATIO * video.seconds):
         notes.append(
             f"the video is damaged or cut off: {decoded_count} frames of {time:.1f} s could be read, of "
             f"{video.seconds:.1f} s that it should have; copy it again if there is more"
         )
-    if interlaced:
+    if is_interlaced:
         notes.append("the video is interlaced, so moving edges look like combs; record progressive video (p, not i)")
     return _VideoMeasurement(
         np.array(numbers),
@@ -357,6 +358,7 @@ def frame_times(folder: Path) -> dict[str, float]:
 
 
 def _frame_name(number: int) -> str:
+    """Return the file name of the frame with this number in the video."""
     return f"frame_{number:06d}.jpg"
 
 

@@ -51,7 +51,7 @@ class Video:
         import av
 
         self._container.seek(0)
-        start, number, last = None, 0, 0.0
+        first_time, number, last_time = None, 0, 0.0
         packets = self._container.demux(self._stream)
         while True:
             try:
@@ -70,10 +70,10 @@ class Video:
                 if getattr(frame, "is_corrupt", False):
                     self.damaged_count += 1
                     continue
-                time = last if frame.time is None else float(frame.time)
-                start = time if start is None else start
-                last = time
-                yield number, time - start, frame
+                time = last_time if frame.time is None else float(frame.time)
+                first_time = time if first_time is None else first_time
+                last_time = time
+                yield number, time - first_time, frame
                 number += 1
 
 
@@ -152,5 +152,6 @@ def _apply_display_matrix(picture: Image, frame: Any) -> Image:
 
 
 def _error_text(error: Exception) -> str:
+    """Return the first line of an error's message, shortened, or its type if it has none."""
     text = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return text.splitlines()[0][:120]
