@@ -121,7 +121,8 @@ class StageCache:
                 self.reporter.begin(name)
                 facts, files = execute(resuming)
         except KeyboardInterrupt as error:
-            self.state.add_seconds(name, clock.unrecorded_seconds())
+            with suppress(HyrfError):  # on a full disk, too, the user needs to see that the stage was stopped
+                self.state.add_seconds(name, clock.unrecorded_seconds())
             raise Stopped(name, getattr(error, "preview", None)) from error
         except HyrfError as error:
             self._record_failure(name, clock)

@@ -82,6 +82,19 @@ def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products,
     assert list(result.kept) == done[:-1]
 
 
+def test_an_interrupt_on_a_full_disk_is_still_an_interrupt(posed, tmp_path, monkeypatch):
+    def fill_disk_and_stop(*arguments, **options):
+        monkeypatch.setattr("hyrfpack.make.state.write_atomic", fail)
+        raise KeyboardInterrupt
+
+    def fail(path, data):
+        raise HyrfError(f"{path}: the disk is full", fix="free some space")
+
+    monkeypatch.setattr(stages, "train_model", fill_disk_and_stop)
+    with pytest.raises(Stopped, match="stopped in training"):
+        make_scene(posed, tmp_path / "scene.html")
+
+
 def record_details(details: list[str]) -> RunContext:
     """Return a context that adds the most important description of each event to a list."""
     return RunContext(progress=lambda event: details.extend(event.details[:1]))
