@@ -5,18 +5,18 @@
 import { frameAxes, rotateBack, rotateBy, rowsOf, transpose } from "../../hyrf/rotation.js";
 import { add, cross, dot, mul, sub, unit } from "../../hyrf/vectors.js";
 
-const DIGITS_BELOW_UNIT = 4; // of positions, in a scene of one unit
+const POSITION_DIGITS_IN_UNIT_SCENE = 4; // behind the decimal point
 const DIRECTION_DIGITS = 6;
-const AXES = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] };
+const AXIS_VECTORS = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] };
 // An action takes the place of an earlier one of the same option, unless one of these lies between.
 const SEPARATORS = { "crop-box": ["scale", "upright"], "max-scale": ["scale"], "min-opacity": [], up: ["upright"] };
 
 // Returns the index of the action that another one of the option would replace, or -1.
 export function findActive(actions, option) {
   const separators = SEPARATORS[option] ?? actions.map((action) => action.option);
-  const last = actions.findLastIndex((action) => separators.includes(action.option));
-  const found = actions.findLastIndex((action) => action.option === option);
-  return found > last ? found : -1;
+  const lastSeparator = actions.findLastIndex((action) => separators.includes(action.option));
+  const index = actions.findLastIndex((action) => action.option === option);
+  return index > lastSeparator ? index : -1;
 }
 
 // Returns the actions with another one, which replaces the active one of its option.
@@ -33,12 +33,13 @@ export function dropAction(actions, option) {
 
 // Returns where actions move a scene, p' = factor rows p in world units, and the up direction after them.
 export function placementAfter(actions, scene) {
-  let factor = 1, rows = [AXES.x, AXES.y, AXES.z], up = unit(scene.up);
+  let factor = 1, rows = [AXIS_VECTORS.x, AXIS_VECTORS.y, AXIS_VECTORS.z], up = unit(scene.up);
   for (const { option, value } of actions) {
     if (option === "scale") factor *= value;
     if (option === "up") up = unit(value);
     if (option === "upright") {
-      const turn = uprightRows(up, AXES[value]), columns = transpose(rows).map((column) => rotateBy(turn, column));
+      const turn = uprightRows(up, AXIS_VECTORS[value]);
+      const columns = transpose(rows).map((column) => rotateBy(turn, column));
       rows = transpose(columns);
       up = rotateBy(turn, up);
     }
@@ -71,7 +72,7 @@ export function worldFromPage({ factor, rows }, scene) {
   return transpose(columns).map((row, axis) => [...row, shift[axis]]);
 }
 
-// Returns what selection.js shall keep after actions.
+// Returns the selections of Gaussians (see selection.js) that actions keep.
 export function selectionsOf(actions, scene) {
   return actions.flatMap(({ option, value, isInverted = false }, index) => {
     const placement = placementAfter(actions.slice(0, index), scene);
@@ -102,7 +103,7 @@ function turnedBack(rows, turn, middle) {
 
 // Rounds a position or a length to a step that is invisible in a scene of a size, both in world units.
 export function roundLength(value, size) {
-  const digits = Math.min(20, Math.max(0, DIGITS_BELOW_UNIT - Math.floor(Math.log10(size))));
+  const digits = Math.min(20, Math.max(0, POSITION_DIGITS_IN_UNIT_SCENE - Math.floor(Math.log10(size))));
   return Number(value.toFixed(digits)) + 0; // turns -0 into 0
 }
 

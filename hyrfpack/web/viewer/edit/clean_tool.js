@@ -3,21 +3,21 @@
 import { element } from "../dom.js";
 import { dropAction, findActive, putAction } from "./actions.js";
 
-const MAX_OPACITY = 0.5; // removed at the end of the slider; positions between grow with the square
-const LENGTH_DECADES = 2.5; // the slider goes from the scene's size down to a part of 10 to the power of -2.5
+const MAX_REMOVED_OPACITY = 0.5; // the opacity grows with the square of the slider's position
+const LENGTH_SLIDER_DECADES = 2.5; // the slider goes from the scene's size down to 10^-2.5 of it
 
 // Slider positions are 0 to 1. Values are numbers of the command, with few digits.
 const SLIDERS = {
   faint: {
     option: "min-opacity",
-    valueOf: (position) => Number((MAX_OPACITY * position ** 2).toPrecision(2)),
-    positionOf: (value) => Math.sqrt(value / MAX_OPACITY),
+    valueOf: (position) => Number((MAX_REMOVED_OPACITY * position ** 2).toPrecision(2)),
+    positionOf: (value) => Math.sqrt(value / MAX_REMOVED_OPACITY),
     textOf: (value) => `opacity < ${value}`,
   },
   large: {
     option: "max-scale",
-    valueOf: (position, size) => Number((size * 10 ** (-LENGTH_DECADES * position)).toPrecision(2)),
-    positionOf: (value, size) => -Math.log10(value / size) / LENGTH_DECADES,
+    valueOf: (position, size) => Number((size * 10 ** (-LENGTH_SLIDER_DECADES * position)).toPrecision(2)),
+    positionOf: (value, size) => -Math.log10(value / size) / LENGTH_SLIDER_DECADES,
     textOf: (value) => `longer than ${value}`,
   },
 };

@@ -4,9 +4,9 @@ import { ENTRY_BYTES, HEADER_BYTES, MAGIC_BYTES } from "../../hyrf/container.js"
 import { crc32 } from "../../hyrf/crc.js";
 
 const MAJOR_VERSION = 1;
-const ALIGNMENT = 8; // of sections, in bytes
+const SECTION_ALIGNMENT_BYTES = 8;
 
-const padded = (length) => ALIGNMENT * Math.ceil(length / ALIGNMENT);
+const padded = (length) => SECTION_ALIGNMENT_BYTES * Math.ceil(length / SECTION_ALIGNMENT_BYTES);
 
 // Returns the bytes of a file of sections {type, codec, flags, raw: their decoded length, data}.
 export function writeContainer(sections, minor) {

@@ -4,11 +4,14 @@
 import { element } from "../dom.js";
 import { add, cross, dot, mul, sub } from "../../hyrf/vectors.js";
 
-const STEP_RATIO = 0.01; // of the scene's size, for an arrow key; ten times as much with Shift
-const STEP_DEGREES = 1;
-const MARGIN = 24; // of a handle to the window's edge, in CSS pixels
-const TURN_HANDLE_RATIO = 0.3; // its distance from an edge, of that of the edge from the box's centre
-const FACES = [0, 1, 2].flatMap((axis) => [{ axis, side: 0 }, { axis, side: 1 }]);
+// An arrow key moves a side by this ratio of the scene's size, or turns the box by this angle; with Shift, ten times.
+const KEY_STEP_RATIO = 0.01;
+const KEY_STEP_DEGREES = 1;
+const SHIFT_FACTOR = 10;
+const MIN_HANDLE_MARGIN_PIXELS = 24; // handles that are nearer to the window's edge or the panel are hard to reach
+// The handle that turns the box stands outside of an edge, by this ratio of the edge's distance from the box's centre.
+const TURN_HANDLE_RATIO = 0.3;
+const BOX_FACES = [0, 1, 2].flatMap((axis) => [{ axis, side: 0 }, { axis, side: 1 }]);
 const KEY_SIGNS = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1 };
 // The axis of the picture along which a key moves the box, and its sign.
 const KEY_MOVES = {
@@ -21,7 +24,7 @@ export class CropBox {
   constructor(player, getBox, change) {
     Object.assign(this, { player, getBox, change });
     this.arm = 3; // of those that turnArms returns
-    this.handles = FACES.map(({ axis, side }) => {
+    this.handles = BOX_FACES.map(({ axis, side }) => {
       const letter = "xyz"[axis], label = `${side ? "maximum" : "minimum"} ${letter} of the box`;
       const grab = (event) => this.grabFace(event, axis, side), step = (event) => this.stepFace(event, axis, side);
       return this.createHandle(letter, label, grab, step);
@@ -124,7 +127,7 @@ export class CropBox {
 
   stepTurn(event) {
     const sign = KEY_SIGNS[event.key];
-    return sign ? withTurn(this.getBox().value, sign * STEP_DEGREES * (event.shiftKey ? 10 : 1)) : null;
+    return sign ? withTurn(this.getBox().value, sign * KEY_STEP_DEGREES * (event.shiftKey ? SHIFT_FACTOR : 1)) : null;
   }
 
   // Chooses an arm whose handle can be reached. It stays the same as long as it can.
@@ -155,7 +158,7 @@ export class CropBox {
       handle.hidden = !place;
       if (place) Object.assign(handle.style, { left: `${place[0]}px`, top: `${place[1]}px` });
     };
-    for (const [number, { axis, side }] of FACES.entries()) {
+    for (const [number, { axis, side }] of BOX_FACES.entries()) {
       show(this.handles[number], box && faceMiddle(box, axis, side));
       if (box) this.handles[number].setAttribute("aria-valuenow", box.value[axis + 3 * side]);
     }
@@ -167,7 +170,7 @@ export class CropBox {
 
 const placeOf = ({ clientX, clientY }) => [clientX, clientY];
 
-const stepLength = ({ shiftKey }, { size }) => STEP_RATIO * size * (shiftKey ? 10 : 1);
+const stepLength = ({ shiftKey }, { size }) => KEY_STEP_RATIO * size * (shiftKey ? SHIFT_FACTOR : 1);
 
 const faceMiddle = ({ corner }, axis, side) => {
   const first = corner(...[0, 0, 0].with(axis, side)), last = corner(...[1, 1, 1].with(axis, side));
@@ -188,8 +191,9 @@ function turnArms(box) {
 function isFree(place) {
   if (!place) return false;
   const [x, y] = place, { left, right, top, bottom } = element("edit").getBoundingClientRect();
-  const isUnderPanel = x > left - MARGIN && x < right + MARGIN && y > top - MARGIN && y < bottom + MARGIN;
-  return x > MARGIN && y > MARGIN && x < innerWidth - MARGIN && y < innerHeight - MARGIN && !isUnderPanel;
+  const margin = MIN_HANDLE_MARGIN_PIXELS;
+  const isUnderPanel = x > left - margin && x < right + margin && y > top - margin && y < bottom + margin;
+  return x > margin && y > margin && x < innerWidth - margin && y < innerHeight - margin && !isUnderPanel;
 }
 
 // Returns the numbers of a box with one of its sides moved, but not beyond the opposite one, which stays where it is.

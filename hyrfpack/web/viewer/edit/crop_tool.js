@@ -7,8 +7,9 @@ import { boxTurn, middleOf, placementAfter, roundLength } from "./actions.js";
 import { dropAction, findActive, putAction, statedUp } from "./actions.js";
 import { CropBox } from "./crop_box.js";
 
-const OPTION = "crop-box";
-const FIRST_SIDE_RATIO = 0.3; // half the sides of a new box, of the cameras' distance from the scene's target
+const CROP_OPTION = "crop-box";
+// Half a side of a new box, as a ratio of the cameras' distance from the scene's target.
+const NEW_BOX_HALF_SIDE_RATIO = 0.3;
 
 export class CropTool {
   constructor(editor) {
@@ -22,18 +23,18 @@ export class CropTool {
     }
     element("edit-inside").onchange = ({ target }) => this.put({ isInverted: target.checked });
     element("edit-add-box").onclick = () => this.add();
-    element("edit-drop-box").onclick = () => editor.set(dropAction(editor.actions, OPTION));
+    element("edit-drop-box").onclick = () => editor.set(dropAction(editor.actions, CROP_OPTION));
   }
 
   // The action of the box with handles, or undefined.
   get active() {
-    return this.editor.actions[findActive(this.editor.actions, OPTION)];
+    return this.editor.actions[findActive(this.editor.actions, CROP_OPTION)];
   }
 
   // The actions before that of the box. The box turns about the up direction after these.
   get before() {
     const { actions } = this.editor;
-    return actions.slice(0, findActive(actions, OPTION));
+    return actions.slice(0, findActive(actions, CROP_OPTION));
   }
 
   get drawn() {
@@ -55,9 +56,9 @@ export class CropTool {
   // Adds a box about the scene's target.
   add() {
     const { editor } = this, { player: { scene, eye }, placement: { factor, rows }, size } = editor;
-    const middle = mul(rotateBy(rows, scene.target), factor), half = FIRST_SIDE_RATIO * (eye.size || 1) * size;
+    const middle = mul(rotateBy(rows, scene.target), factor), half = NEW_BOX_HALF_SIDE_RATIO * (eye.size || 1) * size;
     const value = [-half, half].flatMap((side) => middle.map((place) => roundLength(place + side, size)));
-    editor.set([...editor.actions, { option: OPTION, value }]);
+    editor.set([...editor.actions, { option: CROP_OPTION, value }]);
   }
 
   // Changes the box with handles, unless it was undone meanwhile. The command states up before a box that is turned
@@ -70,7 +71,7 @@ export class CropTool {
     const tenths = Math.round(10 * (value[6] ?? 0));
     const degrees = (tenths + 3600 * Math.round(-tenths / 3600)) / 10; // over -180, to 180
     if (degrees) rounded.push(degrees);
-    const action = { option: OPTION, value: rounded, ...(isInverted && { isInverted }) };
+    const action = { option: CROP_OPTION, value: rounded, ...(isInverted && { isInverted }) };
     let { actions } = editor;
     if (degrees && !before.some(({ option }) => option === "up")) {
       actions = actions.toSpliced(before.length, 0, statedUp(placementAfter(before, editor.player.scene).up));

@@ -146,11 +146,11 @@ export class Editor {
     this.isApplying = true;
     try {
       for (;;) {
-        const selections = selectionsOf(this.actions, player.scene), wanted = JSON.stringify(selections);
-        if (wanted === this.applied) break;
+        const selections = selectionsOf(this.actions, player.scene), selectionsJson = JSON.stringify(selections);
+        if (selectionsJson === this.applied) break;
         this.applied = null;
         this.count = (await player.select(selections)).at(-1) ?? null;
-        this.applied = wanted;
+        this.applied = selectionsJson;
         this.refresh();
       }
     } finally {

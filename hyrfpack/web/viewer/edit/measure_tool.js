@@ -4,7 +4,7 @@ import { element } from "../dom.js";
 import { add, mul, sub } from "../../hyrf/vectors.js";
 import { PointPicker } from "./point_picker.js";
 
-const DIGITS = 4; // of distances
+const DISTANCE_DIGITS = 4;
 const FACTOR_DIGITS = 6;
 
 export class MeasureTool {
@@ -33,7 +33,7 @@ export class MeasureTool {
   }
 
   get text() {
-    return this.distance === null ? "" : `${Number(this.distance.toPrecision(DIGITS))} units`;
+    return this.distance === null ? "" : `${Number(this.distance.toPrecision(DISTANCE_DIGITS))} units`;
   }
 
   get drawn() {

@@ -6,7 +6,7 @@ import { defaultViewpoint } from "../../hyrf/viewpoint.js";
 
 const MIN_TURN_RADIANS = 1e-12; // a frame that is turned by less is not turned
 const CAMERA_KEYS = ["cameras", "coarse_cameras"];
-const INTRINSICS = 6; // numbers of a stored camera before its pose
+const INTRINSIC_COUNT = 6; // a stored camera has these numbers before its pose
 
 // Returns metadata after a placement, p' = factor rows p. `statesUp` is whether the placement's up replaces that of the
 // file.
@@ -36,6 +36,7 @@ function followPlacement(stored = { factor: 1, rotation: IDENTITY_QUAT, offset: 
 const turnBy = (rows, { rotation }) =>
   quatOf(transpose(transpose(frameAxes({ rotation })).map((axis) => rotateBy(rows, axis))));
 
+// Returns the frame of a moved model; like that of a file, it has a rotation only if it is turned.
 function moveFrame(frame, { factor, rows }) {
   const { rotation, ...rest } = frame, quat = turnBy(rows, frame);
   const isTurned = 2 * Math.hypot(...quat.slice(1)) >= MIN_TURN_RADIANS;
@@ -45,8 +46,8 @@ function moveFrame(frame, { factor, rows }) {
 
 // Moves 18 numbers: those of the lens, and the rows of the pose.
 function moveCamera(numbers, placement) {
-  const pose = [0, 1, 2].map((r) => numbers.slice(INTRINSICS + 4 * r, INTRINSICS + 4 * r + 4));
-  return [...numbers.slice(0, INTRINSICS), ...pose.flatMap((row) => moveRow(row, placement))];
+  const pose = [0, 1, 2].map((r) => numbers.slice(INTRINSIC_COUNT + 4 * r, INTRINSIC_COUNT + 4 * r + 4));
+  return [...numbers.slice(0, INTRINSIC_COUNT), ...pose.flatMap((row) => moveRow(row, placement))];
 }
 
 const moveRow = (row, { factor, rows }) => [...rows.map((axis) => dot(axis, row)), factor * row[3]];

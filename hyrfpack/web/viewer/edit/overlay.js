@@ -3,10 +3,10 @@
 import { element } from "../dom.js";
 import { Projection } from "./projection.js";
 
-const SVG = "http://www.w3.org/2000/svg";
+const SVG_NAMESPACE = "http://www.w3.org/2000/svg";
 
 const create = (name, attributes, text = "") => {
-  const shape = document.createElementNS(SVG, name);
+  const shape = document.createElementNS(SVG_NAMESPACE, name);
   for (const [key, value] of Object.entries(attributes)) shape.setAttribute(key, value);
   shape.textContent = text;
   return shape;

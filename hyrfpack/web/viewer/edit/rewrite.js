@@ -9,7 +9,7 @@ import { moveMetadata } from "./moved_metadata.js";
 
 const METADATA_OPTIONS = ["up", "upright", "scale"];
 const CODEC_JSON = 0, CODEC_FLOAT32 = 1, CODEC_DEFLATED = 5;
-const COMPACT_CODECS = [5, 6, 7, 8], SHARED_CODECS = [11, 12];
+const COMPACT_CODECS = [5, 6, 7, 8], SHARED_CODECS = [11, 12]; // 5 is CODEC_DEFLATED, which came with the others
 const REQUIRED_FLAG = 1;
 
 // Returns whether actions remove no Gaussians.
@@ -57,6 +57,7 @@ export function writeKept(bytes, { model, kept }, actions, writer) {
   return writeContainer(sections, lowestMinorVersion(sections, config));
 }
 
+// Returns the metadata of a file after actions.
 function editMetadata(metadata, actions) {
   const stated = metadata.provenance.viewpoint?.up ?? [0, -1, 0]; // `upright` follows an `up`, which replaces it
   const placement = placementAfter(actions, { up: stated });
@@ -69,6 +70,7 @@ function encodeJson(value) {
   return new TextEncoder().encode(JSON.stringify(value).replace(/[\u0080-\uffff]/g, escape));
 }
 
+// Returns bytes compressed as a zlib stream.
 async function deflate(bytes) {
   const stream = new Blob([bytes]).stream().pipeThrough(new CompressionStream("deflate"));
   return new Uint8Array(await new Response(stream).arrayBuffer());

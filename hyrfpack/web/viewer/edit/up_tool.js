@@ -7,8 +7,8 @@ import { toast } from "../notifications.js";
 import { findActive, putAction, statedUp } from "./actions.js";
 import { PointPicker } from "./point_picker.js";
 
-const POINTS = 3;
-const MIN_SINE = 0.05; // of the angle at the first point; at smaller ones the points are in a row
+const GROUND_POINT_COUNT = 3;
+const MIN_ANGLE_SINE = 0.05; // at a smaller angle at the first point, the three points are in a row
 
 export class UpTool {
   constructor(editor) {
@@ -37,7 +37,7 @@ export class UpTool {
   }
 
   take(points) {
-    if (points.length === POINTS) {
+    if (points.length === GROUND_POINT_COUNT) {
       const { editor } = this, { scene } = editor.player, cameras = scene.cameras.map(positionOf);
       const up = normalTowards(points, cameras.map((position) => toPage(position, scene)));
       this.picker.clear();
@@ -66,7 +66,7 @@ export class UpTool {
 // Returns the unit normal of three points on the side of most cameras, or null if the points are in a row.
 export function normalTowards([a, b, c], cameras) {
   const normal = cross(unit(sub(b, a)), unit(sub(c, a)));
-  if (Math.hypot(...normal) < MIN_SINE) return null;
+  if (Math.hypot(...normal) < MIN_ANGLE_SINE) return null;
   const above = cameras.filter((position) => dot(sub(position, a), normal) > 0).length;
   return unit(2 * above >= cameras.length ? normal : normal.map((part) => -part));
 }

@@ -7,8 +7,8 @@ import { toast } from "../notifications.js";
 import { dot } from "../../hyrf/vectors.js";
 import { poseOnPath } from "./camera_path.js";
 
-const FRAMES_PER_SECOND = 30; // of a saved path
-const MAX_SIDE_PIXELS = 1920; // of saved cameras
+const PATH_FRAMES_PER_SECOND = 30;
+const MAX_CAMERA_SIDE_PIXELS = 1920;
 
 export class ViewsTool {
   constructor(editor) {
@@ -100,7 +100,7 @@ export class ViewsTool {
   // Returns a camera of a pose for the scene after the actions of the edit.
   cameraOf(pose) {
     const { player, placement: { factor, rows } } = this.editor, { width, height } = player.canvas;
-    const scale = Math.min(1, MAX_SIDE_PIXELS / Math.max(width, height));
+    const scale = Math.min(1, MAX_CAMERA_SIDE_PIXELS / Math.max(width, height));
     const sides = [width, height].map((side) => 2 * Math.max(1, Math.round((side * scale) / 2))); // even, for videos
     const eye = Object.assign(Object.create(player.eye), pose), camera = cameraOf(eye.view(...sides), player.scene);
     const moved = camera.camera_from_world.slice(0, 3).map((row) => {
@@ -114,7 +114,7 @@ export class ViewsTool {
   }
 
   savePath() {
-    const frames = Math.round(this.seconds * FRAMES_PER_SECOND) + 1, { poses } = this;
+    const frames = Math.round(this.seconds * PATH_FRAMES_PER_SECOND) + 1, { poses } = this;
     const digits = String(frames).length;
     this.save(Array.from({ length: frames }, (_, k) => {
       return { name: String(k).padStart(digits, "0"), ...this.cameraOf(poseOnPath(poses, k / (frames - 1))) };
