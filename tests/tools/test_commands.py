@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -39,6 +40,13 @@ def test_a_tool_that_changes_the_environment_answers_help(module: str):
     """It runs in a process of its own, because Triton's interpreter would else be off for later tests."""
     process = subprocess.run([sys.executable, "-m", module, "--help"], cwd=REPOSITORY_ROOT, stdout=subprocess.PIPE)
     assert process.returncode == 0 and b"usage:" in process.stdout
+
+
+@pytest.mark.parametrize("module", sorted(name for name in SOURCE_BY_MODULE if name.startswith("tools.studies.")))
+def test_the_help_of_a_study_names_a_page_that_names_the_study(module: str):
+    paths = re.findall(r"docs/[\w/-]+\.md", SOURCE_BY_MODULE[module].split('"""')[1])
+    pages = [(REPOSITORY_ROOT / path).read_text("utf-8") for path in paths]
+    assert any(module in page or f"{module.replace('.', '/')}.py" in page for page in pages)
 
 
 def test_an_error_that_the_user_can_correct_is_one_line_with_options(capsys: pytest.CaptureFixture[str]):

@@ -12,6 +12,8 @@ PSNR is the mean over the views, against the finest level, without the backgroun
 which a budget reaches 25, 30 and 35 dB, and the PSNR of the finest level of all chunks with its bytes.
 
 Streamed SOG without error tables gets the mean error of each of its levels in the walk.
+
+The results are in docs/research/levels.md.
 """
 
 from __future__ import annotations

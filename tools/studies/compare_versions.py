@@ -17,6 +17,8 @@ Runs are kept in --out and are not repeated while their data set, the version th
 the same. Their scores are kept while this version stays the same. Uncommitted changes and untracked sources count as
 another version. The other version runs with the packages of this environment, and with --against-options for `train`.
 CPU seconds are without the compilation of kernels: each version first trains a few steps on the data set.
+
+The results are in docs/research/earlier-versions.md.
 """
 
 from __future__ import annotations

@@ -8,6 +8,8 @@ photos: of both profiles with their defaults; with --matched, of the smallest `c
 no more SSIM than `paper`; with --finetune, of a fine-tuned file. The last columns are the ratio of measured to
 predicted error at held-out cameras, and seconds. Losses are relative to the trained model. If per-image gains were
 learnt, a held-out photo has the exposure that the exposure map predicts for it.
+
+The results are in docs/research/compression.md.
 """
 
 from __future__ import annotations

@@ -5,6 +5,8 @@
 
 A run's folder has the name of its data set, or of a variant (`set_variants.py`). The render is that of the decoded
 compact file, at the exposure of `hyrfpack render`.
+
+The picture is in docs/research/quality.md.
 """
 
 from __future__ import annotations

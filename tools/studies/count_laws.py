@@ -13,6 +13,8 @@ has, for each photo size, the least-squares fit of PSNR = a + b log2(N), and of 
 --survey writes `FOLDER/SET.csv`, or `FOLDER/SET-SIZE.csv` for several photo sizes, with the columns of the survey of
 compression methods "3DGS.zip" (Submethod, PSNR, SSIM, LPIPS, Size [Bytes], #Gaussians). LPIPS is empty without
 --lpips-weights.
+
+The results are in docs/research/published-scale.md.
 """
 
 from __future__ import annotations

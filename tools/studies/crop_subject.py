@@ -6,6 +6,8 @@
 point that the cameras look at; its radius is given as a share of the median distance from the cameras to that point.
 The model and the cropped model are both compressed. PSNR in dB and SSIM are those of the files on held-out photos, over
 the pixels whose surface lies in the sphere; the model before the crop decides which pixels these are.
+
+The results are in docs/research/crops.md.
 """
 
 from __future__ import annotations

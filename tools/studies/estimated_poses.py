@@ -5,6 +5,8 @@
 
 Photos without an estimated pose are left out of both runs and counted. The table has PSNR in dB on held-out photos,
 which are every 8th of the common ones. Each reconstruction undistorts the photos with its own cameras.
+
+The results are in docs/research/poses.md.
 """
 
 from __future__ import annotations

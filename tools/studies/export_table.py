@@ -7,6 +7,8 @@ Colours are fitted at the training cameras. Every file is read by hyrfpack's rea
 at the held-out views. The table has bytes, seconds of encoding and decoding, and PSNR in dB against the model's
 pictures and against the photos. The line above the table has the seconds of baking. `tests/independent` checks that
 other programs read the same numbers.
+
+The results are in docs/research/export.md.
 """
 
 from __future__ import annotations

@@ -6,6 +6,8 @@ The camera of a scene folder stands still, and the budget of Gaussians changes b
 and all of them. Each step of a fade is as long as on a slow device. For each change the table has the PSNR in dB of the
 pictures before and after it, the number of frames between them that differ, and the least PSNR of two neighbouring
 frames.
+
+The results are in docs/research/levels.md.
 """
 
 from __future__ import annotations

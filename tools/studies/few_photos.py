@@ -6,6 +6,8 @@ Each run trains on three of four training photos of a set or variant (`set_varia
 Runs of another fold have other validation photos and another seed. Cells have PSNR in dB and SSIM, in brackets PSNR of
 up to 8 training photos. All runs have half of the default Gaussian budget. Per-image gains are learnt unless photos
 have transparency or --no-exposure is given. Held-out photos are not used.
+
+The results are in docs/research/few-photos.md.
 """
 
 from __future__ import annotations

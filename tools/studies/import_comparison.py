@@ -9,6 +9,8 @@ hyrfpack makes one model and compresses it for each --psnr. All files are decode
 viewpoints that import holds out, and compared with the original's pictures. The table has bytes, mean and worst PSNR in
 dB, and seconds of compression. The viewpoints are few and far apart, so differences of some tenths of a dB are not
 significant.
+
+The results are in docs/research/import.md.
 """
 
 from __future__ import annotations

@@ -5,6 +5,8 @@
 
 The table has seconds from opening the page of `hyrfpack export` to the first picture and to the complete one, and the
 megabytes of textures and render targets then. The browser is headless Chromium, which draws in software without a GPU.
+
+The results are in docs/research/browser.md.
 """
 
 from __future__ import annotations

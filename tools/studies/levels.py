@@ -8,6 +8,8 @@ PSNR of both on held-out photos. The second one draws views between the cameras,
 measured at, within budgets: the share of all Gaussians, the size of the pictures, the mean Gaussians in a view,
 predicted and measured PSNR against the finest level, the largest difference of both in one view, and the PSNR of the
 level of about as many Gaussians everywhere.
+
+The results are in docs/research/levels.md.
 """
 
 from __future__ import annotations

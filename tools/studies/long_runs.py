@@ -9,6 +9,8 @@ because each run's folder is locked while it is trained and measured. --finetune
 runs. The table has PSNR in dB and SSIM of the raw file on held-out photos, and the gap, which is PSNR on up to 16
 training photos minus that. It also has bytes and scores of the compressed files as decoded from disk, and seconds of
 training. Fewer steps are taken than asked for if pilot runs say so.
+
+The results are in docs/research/long-runs.md, few-photos.md and quality.md.
 """
 
 from __future__ import annotations

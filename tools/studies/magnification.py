@@ -7,6 +7,8 @@ file on held-out photos, at half the size and at the full one, which training ha
 of 0.3 px^2 alone and evaluates the background at every pixel; "photos" samples the scene no more finely than the photos
 did, as `hyrfpack.render_view` does (docs/reference/format.md, 2.10). Runs are kept in --out, and those of this
 version are not repeated.
+
+The results are in docs/research/sampling.md.
 """
 
 from __future__ import annotations

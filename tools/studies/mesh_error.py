@@ -13,6 +13,8 @@ choose for the true surfaces, the same for every mesh. `tools.studies.depth_erro
 of the model's own expected and median depth. Points are trained on as initial Gaussians, so they are not independent.
 
 --mesh FILE measures another mesh in place of the export; --maps FILE writes the depth maps for other programs.
+
+The results are in docs/research/mesh.md.
 """
 
 from __future__ import annotations

@@ -6,6 +6,8 @@ Each model has opaque round Gaussians at random places on five balls that stand 
 without holes, and 100 cameras of 800 x 600 pixels around them. `hyrfpack export` runs in a process of its own, whose
 peak memory is that of the operating system. Errors are distances of the vertices from the surfaces, in per cent of the
 radius of a ball. Each process has one thread unless HYRFPACK_THREADS says otherwise.
+
+The results are in docs/research/mesh.md.
 """
 
 from __future__ import annotations

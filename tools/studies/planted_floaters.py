@@ -10,6 +10,8 @@ the new place. Only those with an opacity above 0.2 and a scale that is usual in
 The columns are: planted and removed Gaussians, recall (the share of the planted that is removed), precision (the share
 of the removed that was planted), and PSNR in dB on held-out photos: of the model, with the floaters, and after they are
 removed. A trained model has floaters of its own, which lower the precision. Rows with the share 0 have nothing planted.
+
+The results are in docs/research/floaters.md.
 """
 
 from __future__ import annotations

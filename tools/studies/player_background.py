@@ -6,6 +6,8 @@ It opens the page of a model in headless Chromium, in a window of 1280 x 800. Wh
 the background again, alternately at each pixel and at nodes that are as far apart as in training. The table has the
 pixels between these nodes, the medians of both times in ms, and their ratio. Without a GPU the browser draws in
 software.
+
+The results are in docs/research/browser.md.
 """
 
 from __future__ import annotations

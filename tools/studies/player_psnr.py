@@ -7,6 +7,8 @@ mean and the worst PSNR in dB of the page of `hyrfpack export` against `render_v
 and as frames are drawn at a part of the resolution while the view moves, against the mean over blocks of the exact
 render. Moving frames have the panorama behind them, or the background of the view, which devices that evaluate it
 quickly enough take. The browser is headless Chromium.
+
+The results are in docs/research/browser.md.
 """
 
 from __future__ import annotations

@@ -9,6 +9,8 @@ correct if its position is then within 2 % of the cameras' extent from the known
 The first table has numbers of photos and the choice between the mappers. The second has errors of the poses (median and
 largest, in degrees and in % of the cameras' extent), and CPU and wall seconds of each stage. The study prints each row
 as JSON first. The scenes are kept in --out for training.
+
+The results are in docs/research/poses.md.
 """
 
 from __future__ import annotations

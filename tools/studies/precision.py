@@ -16,6 +16,8 @@ A difference from `float32` is significant only if it is larger than the spread 
 any rounding until two runs differ as much as two seeds. The table has PSNR in dB and SSIM on held-out views, the number
 of Gaussians and seconds. Scores of this version that --out already has are not measured again. The row `float32` is
 always there, because all others are compared with it.
+
+The results are in docs/explanation/numerics.md and training.md.
 """
 
 from __future__ import annotations

@@ -6,6 +6,8 @@ Each process has one thread. The table has PSNR in dB and SSIM on held-out photo
 process, seconds, and the share of time waiting for other processes. Parallel efficiency is W0 T0 / (W T) for
 the first number W0 of processes, which takes T0 seconds, and W processes, which take T. It is meaningful only if each
 process has its own core.
+
+The results are in docs/research/scaling.md.
 """
 
 from __future__ import annotations

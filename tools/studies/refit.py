@@ -11,6 +11,8 @@ The columns are PSNR in dB of the region, on pixels that mostly show it: of the 
 refit. Without --held-out, every eighth training photo is a validation photo, which the refit
 leaves out; the model itself was trained on these. With it, photos are the held-out ones. --factors multiply all
 learning rates.
+
+The results are in docs/research/refit.md.
 """
 
 from __future__ import annotations

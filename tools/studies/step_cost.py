@@ -7,6 +7,8 @@ The Gaussians are an even selection of those of --model; if it has fewer, they a
 are scaled to --size. Each number of Gaussians runs in its own process. The table has median seconds of a step, seconds
 of the step with a round of density control, peak memory in MB, and the bytes per Gaussian that training adds after the
 model and the photos are loaded.
+
+The results are in docs/research/scaling.md.
 """
 
 from __future__ import annotations

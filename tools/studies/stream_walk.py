@@ -14,6 +14,8 @@ each. The resolution and the budget are not reduced on slow devices. Of each fol
 - median ms of the frames of a glide
 - megabytes of textures at the end, and the most memory of all processes of the browser (PSS); where it draws in
   software, these hold the textures, too
+
+The results are in docs/research/levels.md.
 """
 
 from __future__ import annotations

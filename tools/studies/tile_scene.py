@@ -5,6 +5,8 @@
 Each copy is a part of its own, shifted along a square grid on the ground by the longest side of its frame. Its chunks
 are those of the scene, with their measured errors, so views in which copies hide each other have smaller errors than
 predicted.
+
+Its scenes are measured in docs/research/levels.md.
 """
 
 from __future__ import annotations

@@ -9,6 +9,8 @@ The columns are PSNR in dB, SSIM, numbers of Gaussians, bytes, losses in dB, sec
 second, training seconds, and ms per frame. Scores are those of the decoded files on held-out views (every 8th;
 Blender-style sets have their own split). Runs are kept in --out (runs/sets/<steps>), and --reuse only measures
 those. It refuses runs of another version, data set or configuration. A file table.json there has the rows of all sets.
+
+The results are in docs/research/quality.md.
 """
 
 from __future__ import annotations

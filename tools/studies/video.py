@@ -7,6 +7,8 @@ The photos are in the order of their names. After a photo come a motion-blurred 
 one or two repeated frames, or neither. The table has the numbers of chosen frames of each kind and seconds. With
 --train it also estimates poses (`hyrfpack.estimate_poses`) and trains, on the photos and on the frames. The table then
 has PSNR in dB on the same held-out photos with their original pixels: every 8th photo that has a pose in both cases.
+
+The results are in docs/research/sharpness.md.
 """
 
 from __future__ import annotations

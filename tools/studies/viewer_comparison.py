@@ -18,6 +18,8 @@ has:
 - psnr: PSNR in dB of the screen's picture against `render_view` without approximations, at the same camera
 
 Values are medians over the repeats. Times need an otherwise idle machine. Without a GPU the browser draws in software.
+
+The results are in docs/research/browser.md.
 """
 
 from __future__ import annotations

@@ -8,6 +8,8 @@ headless Chromium. The table has bytes, PSNR in dB against the pictures of `rend
 difference of PSNR against the photos. With --large it measures the seconds from opening a page to the first and to the
 complete picture. It also measures the ms per frame while a mouse orbits at full resolution. These are medians over
 --repeats, where native and baked pages alternate, each in a new browser. Without a GPU the browser renders in software.
+
+The results are in docs/research/browser.md.
 """
 
 from __future__ import annotations

@@ -13,6 +13,8 @@ Vulkan), in a window of 1280 x 800. When the picture is complete, it measures:
 
 Times of colours, frames and sorts are medians over --repeats; those until the picture is complete come from one visit.
 They need an otherwise idle machine.
+
+The results are in docs/research/browser.md.
 """
 
 from __future__ import annotations
