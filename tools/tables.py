@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 from typing import TypeVar
 
 from hyrfpack.errors import HyrfError
@@ -45,14 +43,6 @@ def print_measured_table(
                 print(markdown_row(row), flush=True)
         except HyrfError as error:
             print(markdown_row([str(subject), str(error), *[""] * (len(columns) - 2)]), flush=True)
-
-
-def merge_rows(path: Path, rows: Sequence[dict], keys: Sequence[str]) -> None:
-    """Add rows to a JSON file of rows; each replaces the one with the same values of `keys`."""
-    stored = json.loads(path.read_text()) if path.exists() else []
-    merged = {tuple(row.get(key) for key in keys): row for row in (*stored, *rows)}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(list(merged.values()), indent=1))
 
 
 def format_cell(value: object) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -13,8 +14,19 @@ import hyrfpack
 from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB
 from hyrfpack.errors import HyrfError
 from tools import tables
+from tools.bench import __main__ as benchmarks
+from tools.json_files import merge_rows
 from tools.safety.train_golden import DEMO_MODEL_FILE
-from tools.studies import compression, design_choices, few_photos, import_comparison, video, web_player, webgpu_player
+from tools.studies import (
+    compression,
+    design_choices,
+    estimated_poses,
+    few_photos,
+    import_comparison,
+    video,
+    web_player,
+    webgpu_player,
+)
 from tools.studies.web_player import psnr
 
 
@@ -34,13 +46,63 @@ def test_an_error_of_a_subject_becomes_its_row_and_rows_are_printed_when_made(ca
 
 def test_merged_rows_replace_those_of_the_same_keys_alone(tmp_path):
     path = tmp_path / "new" / "rows.json"
-    tables.merge_rows(path, [{"set": "a", "steps": 1, "x": 1}, {"set": "b", "steps": 1, "x": 2}], ("set", "steps"))
-    tables.merge_rows(path, [{"set": "a", "steps": 2, "x": 3}, {"set": "b", "steps": 1, "x": 4}], ("set", "steps"))
+    merge_rows(path, [{"set": "a", "steps": 1, "x": 1}, {"set": "b", "steps": 1, "x": 2}], ("set", "steps"))
+    merge_rows(path, [{"set": "a", "steps": 2, "x": 3}, {"set": "b", "steps": 1, "x": 4}], ("set", "steps"))
     assert [(row["set"], row["steps"], row["x"]) for row in json.loads(path.read_text())] == [
         ("a", 1, 1),
         ("b", 1, 4),
         ("a", 2, 3),
     ]
+
+
+def test_an_interrupted_write_leaves_the_stored_rows(tmp_path, monkeypatch):
+    path = tmp_path / "rows.json"
+    merge_rows(path, [{"set": "a"}], ("set",))
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        merge_rows(path, [{"set": "b"}], ("set",))
+    assert json.loads(path.read_text()) == [{"set": "a"}] and list(tmp_path.iterdir()) == [path]
+
+
+def test_rows_of_a_benchmark_are_stored_before_the_next_one_runs(tmp_path, monkeypatch):
+    def run(name: str) -> list[dict]:
+        if name == "ssim":
+            raise KeyboardInterrupt
+        return [{"ms": 1.0}]
+
+    monkeypatch.setattr(benchmarks, "run_benchmark", run)
+    with pytest.raises(KeyboardInterrupt):
+        benchmarks.main(["--only", "fields", "--only", "ssim", "--json", str(tmp_path / "out.json")])
+    assert json.loads((tmp_path / "out.json").read_text())["results"] == {"fields": [{"ms": 1.0}]}
+
+
+def test_a_run_of_few_photos_is_stored_before_the_next_one_starts(tmp_path, monkeypatch):
+    def train_and_score(data: Path, name: str, fold: int, steps: int, exposure: bool) -> few_photos.Scores:
+        if steps == 20:
+            raise KeyboardInterrupt
+        return few_photos.Scores(20.0, 0.5, 22.0)
+
+    monkeypatch.setattr(few_photos, "train_and_score", train_and_score)
+    arguments = ["few_photos", "--steps", "10", "20", "--sets", "a", "--out", str(tmp_path / "few.json")]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(KeyboardInterrupt):
+        few_photos.main()
+    assert [row["steps"] for row in json.loads((tmp_path / "few.json").read_text())] == [10]
+
+
+def test_estimated_poses_keep_the_results_of_other_calls(tmp_path, monkeypatch):
+    def measure(name: str, data: Path, scenes: Path, out: Path, steps: int, seeds: int) -> dict:
+        return {"set": name, "steps": steps, "photos": 9, "lacking": 0, "given": [20.0], "own": [19.0]}
+
+    monkeypatch.setattr(estimated_poses, "measure", measure)
+    for name in "ab":
+        monkeypatch.setattr(sys, "argv", ["estimated_poses", "--sets", name, "--out", str(tmp_path)])
+        estimated_poses.main()
+    assert [row["set"] for row in json.loads((tmp_path / "table.json").read_text())] == ["a", "b"]
 
 
 def test_few_photos_keep_the_results_of_other_calls(tmp_path, monkeypatch):

@@ -11,7 +11,6 @@ runs that alternate in the same process. Times in ms are valid only for the mach
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import pkgutil
 import sys
@@ -26,6 +25,8 @@ from rich.table import Table
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from hyrfpack.measure.machine import describe_machine, format_machine
+from tools.command import run_command
+from tools.json_files import write_json
 from tools.tables import format_cell
 
 Row = dict[str, object]
@@ -56,9 +57,9 @@ def format_table(name: str, rows: list[Row]) -> Table:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Time the hot operations against their references.")
     parser.add_argument(
-        "--only", action="append", choices=list_benchmarks(), metavar="NAME", help="run only this benchmark"
+        "--only", action="append", choices=list_benchmarks(), help="run only this benchmark; may be given several times"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the machine and the rows to FILE")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the machine and all rows so far to FILE")
     args = parser.parse_args(arguments)
 
     console = Console(width=None if sys.stdout.isatty() else 200, highlight=False)
@@ -68,9 +69,9 @@ def main(arguments: list[str] | None = None) -> None:
     for name in args.only or list_benchmarks():
         results[name] = run_benchmark(name)
         console.print(format_table(name, results[name]))
-    if args.json:
-        args.json.write_text(json.dumps({"machine": facts, "results": results}, indent=1) + "\n")
+        if args.json:
+            write_json(args.json, {"machine": facts, "results": results})
 
 
 if __name__ == "__main__":
-    main()
+    run_command(main)

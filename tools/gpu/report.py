@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import platform
 import re
 import subprocess
@@ -12,8 +11,10 @@ from pathlib import Path
 
 import torch
 
+from hyrfpack.atomic import write_atomic
 from hyrfpack.measure.machine import driver_version, format_machine, package_versions
 from tools.gpu.rows import Row
+from tools.json_files import write_json
 from tools.tables import format_cell, markdown_table
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
@@ -73,17 +74,8 @@ def file_name(name: str) -> str:
 
 def write_report(page: Path, facts: dict[str, object], settings: dict[str, object], rows: Sequence[Row]) -> None:
     """Write a page and, beside it, a JSON file of the same name."""
-    page.parent.mkdir(parents=True, exist_ok=True)
-    content = {"machine": facts, "settings": settings, "rows": list(rows)}
-    _replace_text(page.with_suffix(".json"), json.dumps(content, indent=1) + "\n")
-    _replace_text(page, format_page(facts, rows))
-
-
-def _replace_text(path: Path, text: str) -> None:
-    """Write a file in one piece, so that a kill during the write leaves the previous one."""
-    part = path.with_name(path.name + ".part")
-    part.write_text(text)
-    part.replace(path)
+    write_json(page.with_suffix(".json"), {"machine": facts, "settings": settings, "rows": list(rows)})
+    write_atomic(page, format_page(facts, rows).encode())
 
 
 def format_page(facts: dict[str, object], rows: Sequence[Row]) -> str:

@@ -36,6 +36,7 @@ from hyrfpack.render import renderer
 from hyrfpack.scene import Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig
 from tools.command import run_command
+from tools.json_files import write_json
 from tools.studies.ablation_models import FULL_VARIANT, NO_CULLING_VARIANT, TRAINED_VARIANTS, Variant, build_trainer
 from tools.studies.reuse import describe_origin, remove_outdated
 from tools.studies.train_sets import make_study_parser
@@ -240,7 +241,7 @@ def main() -> None:
             if not (args.reuse and path.exists()):
                 config = TrainConfig(steps=args.steps, seed=seed)
                 result = train_and_measure(variant, scene, config, folder / "full.hyrf", cache)
-                path.write_text(json.dumps(result, indent=1))
+                write_json(path, result)
             result = json.loads(path.read_text())
             results[variant.name, name].append(result)
             summary = result.get("failed") or f"{result['psnr']:.2f} dB, {result.get('seconds', 0):.0f} s"

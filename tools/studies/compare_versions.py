@@ -46,6 +46,7 @@ from hyrfpack.train import TrainConfig
 from hyrfpack.train.setup import budget_for
 from tools.command import run_command
 from tools.cpu_time import children_cpu_seconds
+from tools.json_files import write_json
 from tools.studies.reuse import REPOSITORY_ROOT, describe_origin, describe_version, remove_outdated
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
@@ -100,7 +101,7 @@ def train_and_score(
         budget = [] if gaussians is None else ["--max-gaussians", str(gaussians)]
         start_seconds = children_cpu_seconds()
         _run_command(version, "train", str(scene.path), "-o", str(out), *command_options, *budget)
-        cpu_time.write_text(json.dumps(children_cpu_seconds() - start_seconds))
+        write_json(cpu_time, children_cpu_seconds() - start_seconds)
     default_file, packed = out / "compact.hyrf", out / f"compact{suffix}.hyrf"
     packed.unlink(missing_ok=True)
     limit = [] if size == 1 else ["--target-size", str(round(size * default_file.stat().st_size))]
@@ -113,7 +114,7 @@ def train_and_score(
         "seconds": json.loads(cpu_time.read_text()),
         "gaussians": json.loads((out / "metrics.json").read_text())["gaussians"],
     }
-    scores_file.write_text(json.dumps(result))
+    write_json(scores_file, result)
     return result
 
 

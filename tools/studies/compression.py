@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import time
 from pathlib import Path
 
@@ -32,6 +31,7 @@ from hyrfpack.format.codec import load_with_provenance, packed_provenance
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import evenly_spaced
 from tools.command import run_command
+from tools.json_files import write_json
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
@@ -188,7 +188,7 @@ def main() -> None:
         rows.append(TrainedSet(folder, options.data / folder.name).measure(options.finetune, options.matched))
         print(format_table(rows[-1:]), flush=True)
         if options.json:
-            options.json.write_text(json.dumps(rows, indent=1))
+            write_json(options.json, rows)
     print("\n" + format_table(rows))
 
 

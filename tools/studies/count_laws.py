@@ -33,6 +33,7 @@ from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
 from hyrfpack.format.sections import LOGIT_SECTIONS, POSITIONS, TABLE_SECTIONS
 from hyrfpack.train import TrainConfig
 from tools.command import run_command
+from tools.json_files import write_json
 from tools.studies.reuse import describe_origin, remove_outdated
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
@@ -86,7 +87,7 @@ def measure(data: Path, size: int, count: int, steps: int, folder: Path, lpips_w
     total = report.bytes_after
     rest = total - sum(parts.values())
     row = CountRow(size, report.gaussians, total, scores.psnr, scores.ssim, scores.lpips, **parts, rest=rest)
-    (folder / ROW_FILE).write_text(json.dumps(asdict(row)))
+    write_json(folder / ROW_FILE, asdict(row))
     return row
 
 

@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import statistics
 from pathlib import Path, PurePosixPath
 
 import hyrfpack
 from hyrfpack.scene import Scene
 from tools.command import run_command
+from tools.json_files import merge_rows
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
 
@@ -64,7 +64,7 @@ def measure(name: str, data: Path, scenes: Path, out: Path, steps: int, seeds: i
         kind: [train_and_score(scene, out / name / f"{kind}-{seed}", steps, seed) for seed in range(seeds)]
         for kind, scene in (("given", given), ("own", own))
     }
-    return {"set": name, "photos": len(given.views), "lacking": missing, **scores}
+    return {"set": name, "steps": steps, "photos": len(given.views), "lacking": missing, **scores}
 
 
 def format_table(rows: list[dict]) -> str:
@@ -94,11 +94,10 @@ def main() -> None:
     args = parser.parse_args()
     names = args.sets or sorted(folder.name for folder in args.scenes.iterdir() if (folder / "sparse").is_dir())
     rows = []
-    args.out.mkdir(parents=True, exist_ok=True)
     for name in names:
         rows.append(measure(name, args.data, args.scenes, args.out, args.steps, args.seeds))
         print(format_table(rows[-1:]).splitlines()[2], flush=True)
-        (args.out / "table.json").write_text(json.dumps(rows, indent=1))
+        merge_rows(args.out / "table.json", rows[-1:], keys=("set", "steps"))
     print("\n" + format_table(rows))
 
 

@@ -22,9 +22,10 @@ from hyrfpack.scene import evenly_spaced
 from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.pilots import split
 from tools.command import run_command
+from tools.json_files import merge_rows
 from tools.studies.set_variants import load_variant
 from tools.studies.train_sets import DATA_FOLDER
-from tools.tables import markdown_table, merge_rows
+from tools.tables import markdown_row, markdown_table
 
 VALIDATION_EVERY = 4
 MAX_TRAINING_VIEWS_SCORED = 8
@@ -81,14 +82,14 @@ def main() -> None:
     rows = []
     for name in args.sets:
         for fold in range(args.folds):
-            scores = [train_and_score(args.data, name, fold, steps, args.exposure) for steps in args.steps]
-            rows.append([name, str(fold), *map(str, scores)])
-            print(" | ".join(rows[-1]), flush=True)
-            results = [
-                {"set": name, "fold": fold, "steps": steps, "exposure": args.exposure, **dataclasses.asdict(score)}
-                for steps, score in zip(args.steps, scores, strict=True)
-            ]
-            merge_rows(args.out, results, keys=("set", "fold", "steps", "exposure"))
+            cells = [name, str(fold)]
+            for steps in args.steps:
+                scores = train_and_score(args.data, name, fold, steps, args.exposure)
+                settings = {"set": name, "fold": fold, "steps": steps, "exposure": args.exposure}
+                merge_rows(args.out, [{**settings, **dataclasses.asdict(scores)}], keys=list(settings))
+                cells.append(str(scores))
+            rows.append(cells)
+            print(markdown_row(cells), flush=True)
     print("\n" + markdown_table(["set", "fold", *(f"{steps:,} steps" for steps in args.steps)], rows))
 
 

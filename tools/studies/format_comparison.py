@@ -20,7 +20,6 @@ The results are in docs/research/compression.md.
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -49,6 +48,7 @@ from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS
 from tools.command import run_command
+from tools.json_files import write_json
 from tools.studies import gsplat_png
 
 # The settings with which each profile is measured; a profile without an entry uses its defaults.
@@ -331,7 +331,7 @@ def plot(rows: Sequence[MeasuredFile], trained: float, baked: float, title: str,
 def write_report(path: Path, measure: Measurements, rows: list[MeasuredFile]) -> None:
     """Write the scores of the model and the rows that are measured so far as JSON."""
     report = {"trained_psnr": measure.trained[0], "baked_psnr": measure.baked_psnr, "rows": list(map(asdict, rows))}
-    path.write_text(json.dumps(report, indent=1))
+    write_json(path, report)
 
 
 def main() -> None:

@@ -29,6 +29,7 @@ from hyrfpack.lock import exclusive_folder
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig
 from tools.command import run_command
+from tools.json_files import write_json
 from tools.studies.reuse import check_origin, describe_origin, write_origin
 from tools.studies.set_variants import load_variant
 from tools.studies.train_sets import DATA_FOLDER, list_sets
@@ -81,7 +82,7 @@ def measure(run: QueuedRun, data: Path, out: Path, finetune_steps: int) -> bool:
     if finetune_steps:
         tuned = _compress_and_score(folder, scene, "compact", finetune_steps)
         row["finetuned"] = {**tuned, "steps": finetune_steps}
-    (folder / MEASUREMENT_FILE).write_text(json.dumps(row, indent=1))
+    write_json(folder / MEASUREMENT_FILE, row)
     return True
 
 

@@ -45,6 +45,7 @@ from hyrfpack.train import TrainConfig
 from hyrfpack.train.optimizer import Optimizer
 from hyrfpack.train.trainer import Trainer
 from tools.command import run_command
+from tools.json_files import write_json
 from tools.studies.reuse import describe_origin
 from tools.studies.train_sets import make_study_parser
 
@@ -141,8 +142,7 @@ def main() -> None:
                     "seconds": seconds,
                 }
                 scores[key]["origin"] = origin
-                args.out.mkdir(parents=True, exist_ok=True)
-                scores_file.write_text(json.dumps(scores, indent=1))
+                write_json(scores_file, scores)
             score, base = scores[key], scores[f"{name}, {BASELINE_ROW}, {args.steps}"]["psnr"]
             print(
                 f"| {name} | {row} | {score['psnr']:.3f} | {score['psnr'] - base:+.3f} | {score['ssim']:.4f} | "

@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 
 from hyrfpack.errors import HyrfError
+from tools.json_files import write_json
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
 ORIGIN_FILE = "origin.json"
@@ -105,5 +106,4 @@ def remove_outdated(folder: Path, origin: Origin) -> None:
 
 def write_origin(folder: Path, origin: Origin) -> None:
     """Store how the result in a folder is made."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / ORIGIN_FILE).write_text(json.dumps(origin, indent=1))
+    write_json(folder / ORIGIN_FILE, origin)

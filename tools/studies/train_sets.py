@@ -27,9 +27,10 @@ import hyrfpack
 from hyrfpack.errors import HyrfError
 from hyrfpack.train import TrainConfig
 from tools.command import run_command
+from tools.json_files import merge_rows
 from tools.studies.reuse import ORIGIN_FILE, check_origin, describe_origin, write_origin
 from tools.studies.set_variants import load_variant
-from tools.tables import markdown_table, merge_rows
+from tools.tables import markdown_table
 
 COMPRESSED_PROFILES = ("paper", "compact")
 DATA_FOLDER = Path(os.environ.get("HYRFPACK_DATA") or Path(__file__).parents[3] / "shared" / "data")
