@@ -14,6 +14,8 @@ import pytest
 from hyrfpack.errors import HyrfError
 from tools.command import run_command
 from tools.safety import make_golden
+from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
+from tools.safety.train_golden import DEMO_MODEL_FILE, write_demo_photos
 from tools.safety.variants import __main__ as variants
 from tools.studies import export_table, mesh_scale
 from tools.studies.train_sets import list_sets
@@ -87,6 +89,43 @@ def test_an_unknown_format_is_refused_before_anything_is_read(
         export_table.main()
     error = capsys.readouterr().err
     assert "--formats .foo: there is no such format" in error and ".spz v3" in error
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("crop_subject", ["--runs", "runs", "--crops", "fox"], "'fox' is not SET=RADIUS"),
+        ("crop_subject", ["--runs", "runs", "--crops", "fox=-1"], "'fox=-1' is not SET=RADIUS"),
+        ("compare_versions", ["--against", ".", "--shares", "half"], "'half' is neither a positive number nor"),
+        ("compare_versions", ["--against", ".", "--only", "a"], "unrecognized arguments: --only"),
+        ("ablations", ["--seeds", "0"], "--seeds: '0' is not an integer of at least 1"),
+        ("web_player", [], "nothing to measure; name --runs, --large or both"),
+    ],
+)
+def test_a_study_refuses_wrong_arguments(name, arguments, message, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [name, *arguments])
+    with pytest.raises(SystemExit) as exit_info:
+        importlib.import_module(f"tools.studies.{name}").main()
+    assert exit_info.value.code == 2 and message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("compression", ["--models", "{folder}"], "there are no models; make them"),
+        ("compression", ["--models", "{folder}", "--sets", "b", "a"], "there are no models: a, b; make them"),
+        ("estimated_poses", ["--scenes", "{folder}/none"], "there are no estimated poses; estimate"),
+        ("poses", ["--data", "{folder}"], "there are no known poses"),
+        ("poses", ["--data", "{folder}", "--sets", "fox"], "there are no known poses .*: fox;"),
+        ("tile_scene", [str(GOLDEN_SCENE_FOLDER), "--copies", "2", "--out", "{folder}"], "it exists already"),
+        ("viewer_comparison", [str(DEMO_MODEL_FILE), "--viewers", "{folder}"], "is not installed|no viewers are"),
+    ],
+)
+def test_a_study_of_what_is_missing_is_an_error_of_one_line(name, arguments, message, tmp_path, monkeypatch):
+    write_demo_photos(tmp_path / "demo")
+    monkeypatch.setattr(sys, "argv", [name, *(word.format(folder=tmp_path) for word in arguments)])
+    with pytest.raises(HyrfError, match=message):
+        importlib.import_module(f"tools.studies.{name}").main()
 
 
 def test_distances_to_the_disk_end_at_its_edge():

@@ -85,7 +85,7 @@ def scored_commands(monkeypatch, tmp_path):
 def test_scores_are_reused_only_for_the_same_data_set_and_version(scored_commands, tmp_path, monkeypatch):
     def trained(data: str, version: str = "a") -> bool:
         scored_commands.clear()
-        scene = SimpleNamespace(path=Path(data), test=[])
+        scene = SimpleNamespace(path=data, test=[])
         compare_versions.train_and_score(Path(version), scene, 100, None, 0, tmp_path / "out")
         return any(command == "train" for _, command, _ in scored_commands)
 
@@ -101,7 +101,7 @@ def test_scores_are_reused_only_for_the_same_data_set_and_version(scored_command
 
 
 def test_kernels_are_compiled_before_the_first_timed_run_of_a_version(scored_commands, tmp_path):
-    scene = SimpleNamespace(path=Path("demo"), test=[])
+    scene = SimpleNamespace(path="demo", test=[])
     for version in ("a", "b"):
         for seed in (0, 1):
             out = tmp_path / f"{version}{seed}"
@@ -124,3 +124,8 @@ def test_a_command_that_is_killed_without_output_is_reported_with_its_exit_code(
     (tmp_path / "hyrfpack" / "__main__.py").write_text("import os; os.kill(os.getpid(), 9)")
     with pytest.raises(HyrfError, match="`hyrfpack train` ended with exit code -9: no output"):
         compare_versions._run_command(tmp_path, "train")
+
+
+def test_a_missing_folder_of_the_other_version_is_an_error_of_one_line(tmp_path):
+    with pytest.raises(HyrfError, match="none: there is no such folder"):
+        reuse.describe_version(tmp_path / "none")

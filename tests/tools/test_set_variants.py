@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scenes import ball_scene
 
+from hyrfpack.errors import HyrfError
 from tools.studies import set_variants
 from tools.studies.set_variants import keep_few_photos, load_variant, split_exposures
 
@@ -66,5 +67,5 @@ def test_names_say_what_is_changed(tmp_path, monkeypatch):
     scene = load_variant(tmp_path, "balls@5@contiguous")
     assert asked == [tmp_path / "balls"] and len(scene.train) == 5
     for wrong in ("balls@0", "balls@dark", "balls@"):
-        with pytest.raises(ValueError, match="balls@"):
+        with pytest.raises(HyrfError, match="balls@.*there is no change"):
             load_variant(tmp_path, wrong)

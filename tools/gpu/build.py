@@ -486,6 +486,8 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--compare", metavar="DIR", help="folder with another version of Triton")
     arguments = parser.parse_args()
+    if arguments.compare and not Path(arguments.compare, "triton").is_dir():
+        parser.error(f"--compare {arguments.compare}: there is no Triton; install one with pip install --target")
     reports = [build_all()]
     if arguments.compare:
         reports.insert(0, build_all_with(arguments.compare))

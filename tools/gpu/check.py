@@ -121,7 +121,9 @@ def run_part(part: str, setup: Setup, seconds: float, item_seconds: float) -> It
 def run_child_items(part: str, setup: Setup, items: Sequence[str]) -> int:
     """Run the items of a part in the child process (see `worker`); return the exit code."""
     module = importlib.import_module(CHECK_PARTS[part][0])
-    return run_child(lambda item: module.run(item, setup), items, lambda: _is_usable(setup.torch_device))
+    from hyrfpack.self_test.worker import is_usable
+
+    return run_child(lambda item: module.run(item, setup), items, lambda: is_usable(setup.torch_device))
 
 
 def report_path(folder: Path, device: str, parts: Sequence[str]) -> Path:
@@ -159,6 +161,8 @@ def main(arguments: list[str] | None = None) -> int:
     if not torch.cuda.is_available():
         print(f"tools.gpu.check: {NO_GPU}", file=sys.stderr)
         return 2
+    if args.data and find_dataset(args.data, None, args.data) is None:
+        parser.error(f"--data {args.data}: there is no data set; name a data set, or a folder of data sets")
     data = find_dataset(args.data, os.environ.get("HYRFPACK_DATA"), REPOSITORY_ROOT.parent / "shared" / "data")
     setup = replace(Setup(data=None if data is None else str(data)), logs=str((args.out / LOGS_FOLDER).absolute()))
     setup = replace(setup, full_run_seconds=args.full_run_seconds)
@@ -183,15 +187,6 @@ def main(arguments: list[str] | None = None) -> int:
 def _format_row(row: Row) -> str:
     cells = [f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}" for key, value in row.items()]
     return "  ".join(cells)
-
-
-def _is_usable(device: torch.device) -> bool:
-    """Return whether the device still works; after an illegal memory access it does not, for the whole process."""
-    try:
-        torch.ones(1, device=device).item()
-    except RuntimeError:
-        return False
-    return True
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from hyrfpack.blocks import run as blocks_run
 from hyrfpack.cameras.placement import Placement
 from hyrfpack.data import PictureCache
 from hyrfpack.scene import Scene, evenly_spaced
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.scenes.layout_city import BLOCKS_PER_SIDE, PITCH_METRES
 from tools.tables import markdown_table
 
@@ -101,9 +101,11 @@ def measure(folder: Path, tiles: int, blocks: int, photos: int, points: int) -> 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="the set `city`")
-    parser.add_argument("--tiles", type=int, nargs="+", default=[1, 4, 16], help="copies of the set (1 4 16)")
-    parser.add_argument("--photos", type=int, default=24, help="photos of each copy (24)")
-    parser.add_argument("--points", type=int, default=60_000, help="points of each copy (60,000)")
+    parser.add_argument(
+        "--tiles", type=positive_integer, nargs="+", default=[1, 4, 16], help="copies of the set (1 4 16)"
+    )
+    parser.add_argument("--photos", type=positive_integer, default=24, help="photos of each copy (24)")
+    parser.add_argument("--points", type=positive_integer, default=60_000, help="points of each copy (60,000)")
     parser.add_argument("--child", type=int, help=argparse.SUPPRESS)  # the blocks of one run
     arguments = parser.parse_args()
     if arguments.child:

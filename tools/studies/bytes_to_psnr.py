@@ -38,7 +38,7 @@ from hyrfpack.scene import Camera, evenly_spaced
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.splats import concatenate
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.tables import markdown_table
 
 TARGETS_DB = (25, 30, 35)
@@ -195,7 +195,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, help="scene folder")
     parser.add_argument("sogs", type=Path, nargs="*", help="folders with a lod-meta.json, of the same model")
-    parser.add_argument("--views", type=int, default=8, help="views of the walk (8)")
+    parser.add_argument("--views", type=positive_integer, default=8, help="views of the walk (8)")
     parser.add_argument("--ratio", type=float, default=1.25, help="of a budget and the one before (1.25)")
     arguments = parser.parse_args()
     folder = FolderScene(arguments.scene)

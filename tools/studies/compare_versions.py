@@ -88,19 +88,20 @@ def train_and_score(
     `out` holds is used again where it comes from the same versions, data, options and number of Gaussians.
     """
     settings = {"steps": steps, "seed": seed, "options": list(options), "gaussians": gaussians}
-    remove_outdated(out, describe_origin(scene.path, describe_version(version), **settings))
-    remove_outdated(out / "scores", describe_origin(scene.path))
+    data = Path(scene.path)
+    remove_outdated(out, describe_origin(data, describe_version(version), **settings))
+    remove_outdated(out / "scores", describe_origin(data))
     suffix = "" if size == 1 else f"-{size:g}"
     scores_file = out / "scores" / f"scores{suffix}.json"
     if scores_file.exists():
         return json.loads(scores_file.read_text())
     cpu_time = out / "cpu_seconds.json"  # The last file of a training.
     if not cpu_time.exists():
-        compile_kernels(version, scene.path, tuple(options))
+        compile_kernels(version, data, tuple(options))
         command_options = ["--steps", str(steps), "--seed", str(seed), "--overwrite", *options]
         budget = [] if gaussians is None else ["--max-gaussians", str(gaussians)]
         start_seconds = children_cpu_seconds()
-        _run_command(version, "train", str(scene.path), "-o", str(out), *command_options, *budget)
+        _run_command(version, "train", str(data), "-o", str(out), *command_options, *budget)
         write_json(cpu_time, children_cpu_seconds() - start_seconds)
     default_file, packed = out / "compact.hyrf", out / f"compact{suffix}.hyrf"
     packed.unlink(missing_ok=True)
@@ -214,12 +215,30 @@ def mean_over_seeds(points: Sequence[dict[str, float]]) -> dict[str, float]:
     return {key: float(np.mean([point[key] for point in points])) for key in SCORE_KEYS}
 
 
+def parse_share(text: str) -> str:
+    """Return a share of the budget as it was written, for the names of folders; argparse reports other texts.
+
+    Raises:
+        ArgumentTypeError: the text is neither a positive number nor ESTIMATED_BUDGET_SHARE.
+    """
+    try:
+        if text == ESTIMATED_BUDGET_SHARE or 0 < float(text) < float("inf"):
+            return text
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"'{text}' is neither a positive number nor '{ESTIMATED_BUDGET_SHARE}'")
+
+
 def make_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
-    parser = make_study_parser(__doc__ or "", 2000, DEFAULT_SETS, Path("runs/quality"))
+    parser = make_study_parser(__doc__ or "", 2000, DEFAULT_SETS, Path("runs/quality"), only=False)
     parser.add_argument("--against", type=Path, required=True, help="folder of the other version")
     parser.add_argument(
-        "--shares", nargs="+", default=["0.25", "0.5", "1", "2"], help="shares of the budget, or 'measured'"
+        "--shares",
+        type=parse_share,
+        nargs="+",
+        default=["0.25", "0.5", "1", "2"],
+        help="shares of this version's budget, or 'measured' (0.25 0.5 1 2)",
     )
     parser.add_argument(
         "--sizes", type=float, nargs="+", default=[1.0], help="bytes of the files, as shares of the default file's (1)"

@@ -32,7 +32,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.scene import evenly_spaced
 from tools.command import run_command
 from tools.json_files import write_json
-from tools.studies.train_sets import DATA_FOLDER
+from tools.studies.train_sets import DATA_FOLDER, choose_names
 from tools.tables import markdown_table
 
 DISTORTION_RANGE = (1e-7, 1e-2)
@@ -182,9 +182,11 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="also write the rows to this file")
     options = parser.parse_args()
     rows = []
-    for folder in sorted(path.parent for path in options.models.glob("*/model.hyrf")):
-        if options.sets and folder.name not in options.sets:
-            continue
+    folders = sorted(path.parent for path in options.models.glob("*/model.hyrf"))
+    trained = [folder.name for folder in folders]
+    fix = "make them with tools.studies.train_sets, and name their folder with `models`"
+    names = choose_names(options.sets, trained, f"{options.models}: there are no models", fix)
+    for folder in (folder for folder in folders if folder.name in names):
         rows.append(TrainedSet(folder, options.data / folder.name).measure(options.finetune, options.matched))
         print(format_table(rows[-1:]), flush=True)
         if options.json:

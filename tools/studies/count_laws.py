@@ -32,7 +32,7 @@ from hyrfpack.format.info import sum_layers
 from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
 from hyrfpack.format.sections import LOGIT_SECTIONS, POSITIONS, TABLE_SECTIONS
 from hyrfpack.train import TrainConfig
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.json_files import write_json
 from tools.studies.reuse import describe_origin, remove_outdated
 from tools.studies.train_sets import make_study_parser
@@ -148,9 +148,11 @@ def write_survey(rows: Sequence[CountRow], folder: Path, name: str) -> None:
 
 
 def main() -> None:
-    parser = make_study_parser(__doc__, 3000, ["mipnerf360_bonsai"], Path("runs/count_laws"), seeds=False)
+    parser = make_study_parser(__doc__, 3000, ["mipnerf360_bonsai"], Path("runs/count_laws"), seeds=False, only=False)
     parser.add_argument("--sizes", type=int, nargs="+", default=[400, 200], help="longer sides of the photos, pixels")
-    parser.add_argument("--counts", type=int, nargs="+", default=[8000, 16000, 32000, 64000], help="Gaussians")
+    parser.add_argument(
+        "--counts", type=positive_integer, nargs="+", default=[8000, 16000, 32000, 64000], help="Gaussians"
+    )
     parser.add_argument("--lpips-weights", type=Path, help="weights of the lpips package")
     parser.add_argument("--survey", type=Path, help="folder for CSV files")
     parser.add_argument(

@@ -12,6 +12,7 @@ The results are in docs/research/crops.md.
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,11 +104,33 @@ def _format_scores(scores: Evaluation) -> str:
     return f"{scores.psnr:.2f}, {scores.ssim:.3f}"
 
 
+def parse_crop(text: str) -> tuple[str, float]:
+    """Return the set and the radius that a text such as "ngp_fox=0.3" gives; argparse reports other texts.
+
+    Raises:
+        ArgumentTypeError: the text has another form, or the radius is no positive number.
+    """
+    name, _, radius = text.partition("=")
+    try:
+        if name and 0 < float(radius) < float("inf"):
+            return name, float(radius)
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"'{text}' is not SET=RADIUS with a positive radius, such as ngp_fox=0.3")
+
+
 def main() -> None:
     parser = make_runs_parser(__doc__ or "")
-    parser.add_argument("--crops", nargs="+", required=True, metavar="SET=RADIUS")
+    parser.add_argument(
+        "--crops",
+        type=parse_crop,
+        nargs="+",
+        required=True,
+        metavar="SET=RADIUS",
+        help="data sets, with the radius of each subject over the median distance of the cameras",
+    )
     arguments = parser.parse_args()
-    shares = {name: float(share) for name, share in (crop.split("=") for crop in arguments.crops)}
+    shares = dict(arguments.crops)
     rows = []
     for name, model_file, scene in load_runs(arguments.runs, arguments.data, list(shares)):
         rows.append([name, f"{shares[name]:g}", *measure(model_file, scene, shares[name])])

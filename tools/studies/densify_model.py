@@ -27,7 +27,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.progress import StepEvent, open_display
 from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 
 # A round can at most double the number, and it only splits Gaussians that were visible since the last round.
 SPLIT_ROUNDS, STEPS_PER_ROUND = 20, 6
@@ -77,7 +77,9 @@ def densify(scene: Scene, model: HybridModel, config: TrainConfig, start: float)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="folder of the scene's photos")
-    parser.add_argument("--gaussians", type=int, default=1_000_000, help="number of Gaussians at the end (1,000,000)")
+    parser.add_argument(
+        "--gaussians", type=positive_integer, default=1_000_000, help="number of Gaussians at the end (1,000,000)"
+    )
     parser.add_argument(
         "--log2-table-size",
         type=int,
@@ -85,7 +87,7 @@ def main() -> None:
         help="size of the radiance grid's table; the geometry grid has half (17)",
     )
     parser.add_argument("--model", type=Path, help="start from this model of the scene instead of training one")
-    parser.add_argument("--steps", type=int, default=1500, help="training steps before splitting (1,500)")
+    parser.add_argument("--steps", type=positive_integer, default=1500, help="training steps before splitting (1,500)")
     parser.add_argument("--final-steps", type=int, default=60, help="training steps after splitting (60)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True)

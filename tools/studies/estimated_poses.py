@@ -18,9 +18,9 @@ from pathlib import Path, PurePosixPath
 
 import hyrfpack
 from hyrfpack.scene import Scene
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.json_files import merge_rows
-from tools.studies.train_sets import DATA_FOLDER
+from tools.studies.train_sets import DATA_FOLDER, choose_names
 from tools.tables import markdown_table
 
 TEST_EVERY = 8
@@ -87,12 +87,14 @@ def main() -> None:
         "--scenes", type=Path, default=Path("runs/poses"), help="folder that `tools.studies.poses` has written"
     )
     parser.add_argument("--sets", nargs="*", help="names of data sets (all in --scenes)")
-    parser.add_argument("--data", type=Path, default=DATA_FOLDER)
-    parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=Path("runs/own-poses"))
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
+    parser.add_argument("--steps", type=positive_integer, default=1000, help="training steps of each run (1,000)")
+    parser.add_argument("--seeds", type=positive_integer, default=1, help="number of seeds for each data set (1)")
+    parser.add_argument("--out", type=Path, default=Path("runs/own-poses"), help="folder for results (runs/own-poses)")
     args = parser.parse_args()
-    names = args.sets or sorted(folder.name for folder in args.scenes.iterdir() if (folder / "sparse").is_dir())
+    posed = sorted(path.parent.name for path in args.scenes.glob("*/sparse"))
+    fix = "estimate poses with tools.studies.poses, and name its folder with `scenes`"
+    names = choose_names(args.sets, posed, f"{args.scenes}: there are no estimated poses", fix)
     rows = []
     for name in names:
         rows.append(measure(name, args.data, args.scenes, args.out, args.steps, args.seeds))

@@ -21,7 +21,7 @@ import hyrfpack
 from hyrfpack.scene import evenly_spaced
 from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.pilots import split
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.json_files import merge_rows
 from tools.studies.set_variants import load_variant
 from tools.studies.train_sets import DATA_FOLDER
@@ -70,7 +70,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sets", nargs="+", default=list(DEFAULT_SETS), help="folders below --data, or variants")
     parser.add_argument(
-        "--steps", type=int, nargs="+", default=[1000, 3000], help="steps of each column (1,000 and 3,000)"
+        "--steps", type=positive_integer, nargs="+", default=[1000, 3000], help="steps of each column (1,000 and 3,000)"
     )
     parser.add_argument("--folds", type=int, default=1, choices=range(1, VALIDATION_EVERY + 1))
     parser.add_argument("--no-exposure", dest="exposure", action="store_false", help="learn no per-image gains")

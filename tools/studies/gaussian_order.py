@@ -34,7 +34,7 @@ from hyrfpack.render.in_view import gaussians_in_view
 from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.density import spatial_order
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.studies.step_cost import resample_gaussians
 from tools.tables import print_measured_table
 
@@ -124,8 +124,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--model", type=Path, required=True, help="a model of that data set")
-    parser.add_argument("--gaussians", type=int, nargs="+", default=[20_000, 200_000])
-    parser.add_argument("--steps", type=int, default=40)
+    parser.add_argument("--gaussians", type=positive_integer, nargs="+", default=[20_000, 200_000])
+    parser.add_argument("--steps", type=positive_integer, default=40)
     options = parser.parse_args(arguments)
     scene = hyrfpack.load_scene(options.data)
     scene = dataclasses.replace(scene, train=scene.train[:MAX_PHOTOS], test=[])

@@ -28,7 +28,7 @@ from hyrfpack.lod import LevelRenderer
 from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Scene, evenly_spaced
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.studies.trained_runs import load_runs, make_runs_parser
 from tools.tables import markdown_table
 
@@ -114,7 +114,7 @@ def measure_views(name: str, folder: Path, scene: Scene) -> list[list[str]]:
 def main() -> None:
     parser = make_runs_parser(__doc__ or "")
     parser.add_argument("--sets", nargs="+", help="data sets; default: all below --runs")
-    parser.add_argument("--chunk-gaussians", type=int, default=2048)
+    parser.add_argument("--chunk-gaussians", type=positive_integer, default=2048)
     arguments = parser.parse_args()
     finest_rows, view_rows = [], []
     for name, model_file, scene in load_runs(arguments.runs, arguments.data, arguments.sets):

@@ -28,7 +28,7 @@ from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.json_files import write_json
 from tools.studies.reuse import check_origin, describe_origin, write_origin
 from tools.studies.set_variants import load_variant
@@ -165,10 +165,10 @@ def format_table(rows: list[dict]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, nargs="+", default=[1000, 3000, 7000, 15000, 30000])
+    parser.add_argument("--steps", type=positive_integer, nargs="+", default=[1000, 3000, 7000, 15000, 30000])
     parser.add_argument("--sets", nargs="+", help="folders below --data, or variants (`set_variants.py`); default: all")
     parser.add_argument(
-        "--seeds", type=int, default=1, help="number of seeds for each data set and number of steps (1)"
+        "--seeds", type=positive_integer, default=1, help="number of seeds for each data set and number of steps (1)"
     )
     parser.add_argument(
         "--exposure",

@@ -52,7 +52,7 @@ def measure(data: Path, steps: int, seed: int, out: Path) -> list[tuple[float, f
 
 
 def main() -> None:
-    parser = make_study_parser(__doc__ or "", 1000, DEFAULT_SETS, Path("runs/magnification"))
+    parser = make_study_parser(__doc__ or "", 1000, DEFAULT_SETS, Path("runs/magnification"), only=False)
     args = parser.parse_args()
     rows = []
     for name in args.sets:

@@ -29,7 +29,7 @@ from hyrfpack.format import save_model
 from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.scene import Camera
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.tables import markdown_table
 
 BALL_RADIUS = 1.0
@@ -42,7 +42,7 @@ OPACITY = 0.95
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("counts", type=int, nargs="+", help="numbers of Gaussians")
+    parser.add_argument("counts", type=positive_integer, nargs="+", help="numbers of Gaussians")
     parser.add_argument("--endings", nargs="+", default=[".mesh.ply", ".collision.obj"], help="what to export")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/mesh_scale"))

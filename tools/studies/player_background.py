@@ -20,7 +20,7 @@ from pathlib import Path
 
 import hyrfpack
 from tools.browser.chromium import Chromium
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.studies.web_player import PAGE_TIMEOUT_SECONDS, WINDOW_SIZE, open_page
 from tools.tables import print_measured_table
 
@@ -54,7 +54,7 @@ def measure_model(browser: Chromium, page: Path, repeats: int) -> list[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", type=Path, nargs="+")
-    parser.add_argument("--repeats", type=int, default=5, help="evaluations with each spacing (5)")
+    parser.add_argument("--repeats", type=positive_integer, default=5, help="evaluations with each spacing (5)")
     arguments = parser.parse_args()
     columns = ["model", "pixels between nodes", "each pixel, ms", "nodes, ms", "ratio"]
     with tempfile.TemporaryDirectory() as folder, Chromium(timeout_seconds=PAGE_TIMEOUT_SECONDS) as browser:

@@ -27,7 +27,7 @@ import hyrfpack
 from hyrfpack.scene import Camera
 from tools.browser.browser import Browser
 from tools.browser.chromium import Chromium
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.studies.web_player import (
     EXACT_SETTINGS,
     PAGE_TIMEOUT_SECONDS,
@@ -112,9 +112,13 @@ def measure_page(browser: Browser, model: Path, views: int, factor: int, enlarge
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", type=Path, nargs="+")
-    parser.add_argument("--views", type=int, default=8, help="number of views of each model (8)")
-    parser.add_argument("--factor", type=int, default=2, help="moving frames have 1/N of the resolution (2)")
-    parser.add_argument("--enlarge", type=int, nargs="+", default=[1], help="sizes of pictures in sizes of photos (1)")
+    parser.add_argument("--views", type=positive_integer, default=8, help="number of views of each model (8)")
+    parser.add_argument(
+        "--factor", type=positive_integer, default=2, help="moving frames have 1/N of the resolution (2)"
+    )
+    parser.add_argument(
+        "--enlarge", type=positive_integer, nargs="+", default=[1], help="sizes of pictures in sizes of photos (1)"
+    )
     arguments = parser.parse_args()
     kinds = ("still", "moving", "moving, view's background")
     columns = [f"{kind}, {statistic} dB" for kind in kinds for statistic in ("mean", "worst")]

@@ -26,6 +26,7 @@ import numpy as np
 import pycolmap
 
 import hyrfpack
+from hyrfpack.errors import HyrfError
 from hyrfpack.poses import estimate
 from hyrfpack.poses.alignment import Poses, align_poses
 from hyrfpack.poses.job import Job
@@ -33,7 +34,7 @@ from hyrfpack.poses.mapping import read_pieces
 from hyrfpack.poses.process import run_stage
 from tools.command import run_command
 from tools.cpu_time import children_cpu_seconds
-from tools.studies.train_sets import DATA_FOLDER
+from tools.studies.train_sets import DATA_FOLDER, choose_names
 from tools.tables import markdown_table
 
 STAGE_NAMES = ("features", "matches", "global", "incremental", "repeat", "finish")
@@ -138,19 +139,20 @@ def format_error_table(rows: list[dict]) -> str:
 
 
 def main() -> None:
-    """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sets", nargs="*")
-    parser.add_argument("--data", type=Path, default=DATA_FOLDER)
-    parser.add_argument("--out", type=Path, default=Path("runs/poses"))
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--sets", nargs="*", help="COLMAP sets below --data (all)")
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
+    parser.add_argument("--out", type=Path, default=Path("runs/poses"), help="folder for the scenes (runs/poses)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed (0)")
     arguments = parser.parse_args()
-    names = arguments.sets or sorted(path.parent.parent.name for path in arguments.data.glob("*/sparse/0"))
+    posed = sorted(path.parent.parent.name for path in arguments.data.glob("*/sparse/0"))
+    fix = "name COLMAP sets with `sets`, and their folder with `data`"
+    names = choose_names(arguments.sets, posed, f"{arguments.data}: there are no known poses (sparse/0)", fix)
     rows = []
     for name in names:
         try:
             rows.append(measure(arguments.data / name, arguments.out / name, arguments.seed))
-        except hyrfpack.HyrfError as error:
+        except HyrfError as error:
             known = read_poses(pycolmap.Reconstruction(arguments.data / name / "sparse" / "0"))
             rows.append({"set": name, "photos": len(known), "error": str(error)})
         print(json.dumps(rows[-1]), flush=True)

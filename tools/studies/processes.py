@@ -20,7 +20,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.studies.reuse import describe_origin, remove_outdated
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_table
@@ -59,8 +59,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=DATA_FOLDER)
     parser.add_argument("--sets", nargs="+", required=True)
-    parser.add_argument("--steps", type=int, default=2000, help="photos of all processes together (2,000)")
-    parser.add_argument("--processes", type=int, nargs="+", default=[1, 2, 4])
+    parser.add_argument("--steps", type=positive_integer, default=2000, help="photos of all processes together (2,000)")
+    parser.add_argument("--processes", type=positive_integer, nargs="+", default=[1, 2, 4])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/processes"))
     options = parser.parse_args(arguments)

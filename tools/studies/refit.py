@@ -30,7 +30,7 @@ from hyrfpack.config.edit import DEFAULT_REFIT_STEPS
 from hyrfpack.config.train import LearningRates
 from hyrfpack.edit.refit import REFIT_RATES, refit_region, score_region
 from hyrfpack.model import HybridModel
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.studies.trained_runs import load_runs, make_runs_parser
 from tools.tables import markdown_table
 
@@ -86,7 +86,7 @@ def main() -> None:
     parser = make_runs_parser(__doc__ or "")
     parser.add_argument("--sets", nargs="*", help="data sets (all below --runs)")
     parser.add_argument("--kinds", nargs="+", choices=SHUFFLED_NAMES, default=list(SHUFFLED_NAMES))
-    parser.add_argument("--steps", type=int, nargs="+", default=[DEFAULT_REFIT_STEPS])
+    parser.add_argument("--steps", type=positive_integer, nargs="+", default=[DEFAULT_REFIT_STEPS])
     parser.add_argument("--factors", type=float, nargs="+", default=[1.0])
     parser.add_argument("--held-out", action="store_true", help="score held-out photos")
     parser.add_argument("--seed", type=int, default=0)
@@ -107,8 +107,9 @@ def main() -> None:
                     has_gains = model.exposure is not None
                     repaired = refit_region(damaged, is_selected, trained, steps, has_gains=has_gains, rates=rates)
                     seconds = time.perf_counter() - start
-                    psnrs = score_region((model, damaged, repaired), is_selected, scored) or []
-                    scores = [f"{psnr:.2f}" for psnr in psnrs]
+                    psnrs = score_region((model, damaged, repaired), is_selected, scored)
+                    # No pixel of these photos may show mostly the region.
+                    scores = ["", "", ""] if psnrs is None else [f"{psnr:.2f}" for psnr in psnrs]
                     row = [name, f"{is_selected.sum():,}", kind, str(steps), f"{factor:g}", *scores, f"{seconds:.0f}"]
                     rows.append(row)
                     print(row, flush=True)

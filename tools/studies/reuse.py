@@ -24,8 +24,10 @@ def describe_version(folder: Path) -> str:
     """Return the last commit that changed the sources of a work tree, with a digest of what is not committed.
 
     Raises:
-        HyrfError: the folder is no work tree of git.
+        HyrfError: there is no such folder, or it is no work tree of git.
     """
+    if not folder.is_dir():
+        raise HyrfError(f"{folder}: there is no such folder", fix="make it with git worktree add")
 
     def run_git(*words: str) -> str:
         process = subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True, check=False)

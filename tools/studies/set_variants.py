@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 import hyrfpack
+from hyrfpack.errors import HyrfError
 from hyrfpack.format.exposure_header import STOPS_PER_LOG_GAIN
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
@@ -31,8 +32,7 @@ def load_variant(data: Path, name: str) -> Scene:
     """Read a variant of a data set below `data`, with the changes that its name gives.
 
     Raises:
-        ValueError: a change is unknown.
-        HyrfDataError: the data set cannot be read.
+        HyrfError: a change is unknown, or the data set cannot be read.
     """
     folder, *changes = name.split("@")
     scene = hyrfpack.load_scene(data / folder)
@@ -42,7 +42,8 @@ def load_variant(data: Path, name: str) -> Scene:
         elif change in ("contiguous", "interleaved"):
             scene = split_exposures(scene, interleaved=change == "interleaved")
         else:
-            raise ValueError(f"'{name}': the change '{change}' is not a number, 'contiguous' or 'interleaved'")
+            problem = f"'{name}': there is no change '{change}' of a data set"
+            raise HyrfError(problem, fix="name a number of photos, 'contiguous' or 'interleaved' after the @")
     return scene
 
 

@@ -31,7 +31,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Picture, Scene, View, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.log import peak_memory
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.tables import markdown_table
 
 MAX_PHOTOS = 8
@@ -85,9 +85,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--model", type=Path, required=True, help="a model of that data set with many Gaussians")
-    parser.add_argument("--gaussians", type=int, nargs="+", default=[50_000, 200_000, 1_000_000, 3_000_000])
+    parser.add_argument(
+        "--gaussians", type=positive_integer, nargs="+", default=[50_000, 200_000, 1_000_000, 3_000_000]
+    )
     parser.add_argument("--size", type=int, nargs=2, default=[800, 600])
-    parser.add_argument("--steps", type=int, default=16)
+    parser.add_argument("--steps", type=positive_integer, default=16)
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.one:

@@ -35,7 +35,7 @@ import hyrfpack
 from hyrfpack.cameras.files import camera_from_numbers, camera_to_json
 from hyrfpack.scene import Camera, evenly_spaced
 from tools.browser.chromium import Chromium
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.studies.large_model import COUNT_TEXTURES_SCRIPT
 from tools.studies.scene_page import serve_scene
 from tools.studies.web_player import PAGE_TIMEOUT_SECONDS, read_stored_cameras
@@ -135,7 +135,7 @@ def main() -> None:
     parser.add_argument("folders", type=Path, nargs="+", help="scene folders")
     parser.add_argument("--unsplit", type=Path, nargs="*", default=[], help=".hyrf files, drawn by a page as they are")
     parser.add_argument("--budget", type=int, default=250_000, help="the most Gaussians to draw (250,000)")
-    parser.add_argument("--stops", type=int, default=8)
+    parser.add_argument("--stops", type=positive_integer, default=8)
     parser.add_argument("--rest", type=float, default=10.0, help="seconds at each stop (10)")
     arguments = parser.parse_args()
     rows = []

@@ -23,6 +23,7 @@ import hyrfpack
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.cameras.placement import Placement
 from hyrfpack.edit.transform import move_frame, move_provenance
+from hyrfpack.errors import HyrfError
 from hyrfpack.format.arrays import parse_config
 from hyrfpack.format.container import Container, Section, read_container, write_container
 from hyrfpack.format.metadata import CODEC_DEFLATED, read_metadata
@@ -30,7 +31,7 @@ from hyrfpack.format.scene_manifest import MANIFEST_NAME, Chunk, ChunkLevel, Sce
 from hyrfpack.format.sections import METADATA, SECTION_CONTENTS
 from hyrfpack.format.shared import CODEC_SHARED, refer_to_section
 from hyrfpack.format.versions import lowest_minor_version
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 
 
 def list_offsets(copies: int, first: np.ndarray, second: np.ndarray) -> list[np.ndarray]:
@@ -64,8 +65,16 @@ def write_file(path: Path, data: bytes) -> tuple[str, int, str]:
 
 
 def tile(source: hyrfpack.SceneFolder, out: Path, copies: int) -> None:
-    """Write the folder of `copies` copies of a scene of one part."""
+    """Write the folder of `copies` copies of a scene of one part.
+
+    Raises:
+        HyrfError: the scene has several parts, or there is something at `out`.
+    """
     manifest = source.manifest
+    if len(manifest.parts) != 1:
+        raise HyrfError(f"the scene has {len(manifest.parts)} parts", fix="split a model of one part")
+    if out.exists():
+        raise HyrfError(f"{out}: it exists already", fix="name a new folder with `out`, or remove this one")
     (part,) = manifest.parts
     viewpoint = Viewpoint.from_json(manifest.viewpoint)
     up = np.asarray(viewpoint.up) / np.linalg.norm(viewpoint.up)
@@ -95,8 +104,8 @@ def tile(source: hyrfpack.SceneFolder, out: Path, copies: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, help="scene folder of one part")
-    parser.add_argument("--copies", type=int, required=True)
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--copies", type=positive_integer, required=True, help="number of copies")
+    parser.add_argument("--out", type=Path, required=True, help="the new scene folder")
     arguments = parser.parse_args()
     tile(hyrfpack.SceneFolder(arguments.scene), arguments.out, arguments.copies)
 

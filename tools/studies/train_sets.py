@@ -26,7 +26,7 @@ from pathlib import Path
 import hyrfpack
 from hyrfpack.errors import HyrfError
 from hyrfpack.train import TrainConfig
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.json_files import merge_rows
 from tools.studies.reuse import ORIGIN_FILE, check_origin, describe_origin, write_origin
 from tools.studies.set_variants import load_variant
@@ -48,6 +48,25 @@ def list_sets(data: Path) -> list[str]:
         fix = "name the folder of the data sets with `data`, or in the environment variable HYRFPACK_DATA"
         raise HyrfError(f"{data}: there are no data sets", fix=fix)
     return names
+
+
+def choose_names(requested: Sequence[str] | None, available: Sequence[str], problem: str, fix: str) -> list[str]:
+    """Return the requested names of data sets, or all available ones if none is requested.
+
+    Args:
+        requested: names from the command line.
+        available: the names that a study can measure.
+        problem: the problem text of the error, without the missing names.
+        fix: what to do next.
+
+    Raises:
+        HyrfError: a requested name is not available, or there are no names at all.
+    """
+    if missing := sorted(set(requested or ()) - set(available)):
+        raise HyrfError(f"{problem}: {', '.join(missing)}", fix=fix)
+    if not available:
+        raise HyrfError(problem, fix=fix)
+    return list(requested or available)
 
 
 def measure(data: Path, name: str, out: Path, config: TrainConfig, reuse: bool) -> dict:
@@ -111,7 +130,7 @@ def format_table(rows: list[dict]) -> str:
 
 
 def make_study_parser(
-    text: str, steps: int, sets: Sequence[str], out: Path, seeds: bool = True
+    text: str, steps: int, sets: Sequence[str], out: Path, *, seeds: bool = True, only: bool = True
 ) -> argparse.ArgumentParser:
     """Return the parser of a study that trains variants on data sets.
 
@@ -119,23 +138,27 @@ def make_study_parser(
         text: the description.
         steps, sets, out: the defaults of --steps, --sets and --out.
         seeds: whether there is the option --seeds.
+        only: whether there is the option --only, for a study whose rows have names.
     """
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=steps, help=f"training steps of each run ({steps:,})")
+    parser.add_argument("--steps", type=positive_integer, default=steps, help=f"training steps of each run ({steps:,})")
     parser.add_argument(
         "--sets", nargs="*", default=list(sets), help=f"data sets: folders below --data ({' '.join(sets)})"
     )
     if seeds:
-        parser.add_argument("--seeds", type=int, default=2, help="number of seeds for each row and data set (2)")
+        parser.add_argument(
+            "--seeds", type=positive_integer, default=2, help="number of seeds for each row and data set (2)"
+        )
     parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
     parser.add_argument("--out", type=Path, default=out, help=f"folder for results ({out})")
-    parser.add_argument("--only", nargs="*", help="run only rows whose names contain one of these words")
+    if only:
+        parser.add_argument("--only", nargs="*", help="run only rows whose names contain one of these words")
     return parser
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--steps", type=positive_integer, default=1000)
     parser.add_argument("--sets", nargs="*", help="folders below --data, or variants (`set_variants.py`); default: all")
     parser.add_argument("--data", type=Path, default=DATA_FOLDER)
     parser.add_argument("--out", type=Path)

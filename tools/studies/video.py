@@ -31,7 +31,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.poses.frames import RECORD_NAME, FrameReport, choose_frames
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train import TrainConfig
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import print_measured_table
 
@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument("--quality", type=int, default=18, help="H.264's constant rate factor (18)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--train", action="store_true", help="also estimate poses and train")
-    parser.add_argument("--steps", type=int, default=1000, help="training steps (1,000)")
+    parser.add_argument("--steps", type=positive_integer, default=1000, help="training steps (1,000)")
     args = parser.parse_args()
     header = ["set", "frames", "photos taken", "blurred taken", "repeated taken", "called blurred", "repeated", "s"]
     header += ["dB, photos", "dB, video", "difference"] if args.train else []

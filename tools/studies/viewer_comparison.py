@@ -51,9 +51,10 @@ import hyrfpack
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.cameras.files import camera_to_json
 from hyrfpack.cameras.paths import look_at
+from hyrfpack.errors import HyrfError
 from hyrfpack.scene import Camera
 from tools.browser.chromium import Chromium
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.studies.web_player import EXACT_SETTINGS, psnr
 from tools.tables import format_cell, markdown_table
 
@@ -222,7 +223,15 @@ class Site:
 
 
 def write_site(folder: Path, model: Path, viewers: Path, pose: Pose) -> list[Viewer]:
-    """Write the pages and the files of a scene into a folder, and return the viewers that show them there."""
+    """Write the pages and the files of a scene into a folder, and return the viewers that show them there.
+
+    Raises:
+        HyrfError: esbuild or the other viewers are not installed.
+    """
+    if not ESBUILD_PROGRAM.exists():
+        raise HyrfError(f"{ESBUILD_PROGRAM}: esbuild is not installed", fix="run npm ci --prefix tests/node")
+    if not (viewers / "node_modules").is_dir():
+        raise HyrfError(f"{viewers}: no viewers are installed here", fix="install them with npm as the help shows")
     (folder / "viewers").symlink_to((viewers / "node_modules").resolve())
     hyrfpack.export_model(model, folder / "player")
     Image.new("RGB", (1, 1)).save(folder / "player" / "poster.jpg")  # the picture has to come from the scene
@@ -300,7 +309,7 @@ def find_times(frames: list[tuple[float, bytes]], opened: float) -> tuple[float,
     pictures = [(moment - opened, decode_png(data)) for moment, data in frames if moment > opened]
     final = pictures[-1][1]
     if not final.std():
-        raise SystemExit("the page stayed blank")
+        raise HyrfError("the page stayed blank", fix="look for errors in the console of a browser")
     detail = FIRST_PICTURE_DETAIL * final.std()
     first = next(moment for moment, picture in pictures if picture.std() >= detail)
     complete = pictures[-1][0]
@@ -325,11 +334,12 @@ def visit(site: Site, folder: Path, viewer: Viewer, reference: np.ndarray) -> tu
                 or not browser.evaluate(viewer.is_final)
             ):
                 if time.time() - opened > PAGE_TIMEOUT_SECONDS:
-                    raise SystemExit(f"{viewer.name}: the picture was not complete after {PAGE_TIMEOUT_SECONDS:.0f} s")
+                    problem = f"{viewer.name}: the picture was not complete after {PAGE_TIMEOUT_SECONDS:.0f} s"
+                    raise HyrfError(problem, fix="measure a smaller model")
                 time.sleep(0.2)
             first, complete = find_times(list(frames), opened)
         if errors := browser.list_errors():
-            raise SystemExit(f"{viewer.name}: {errors}")
+            raise HyrfError(f"{viewer.name}: the page reported {errors}", fix="check the version of the viewer")
         picture = browser.screenshot()
         starts_and_ms = browser.evaluate("window.longTasks")
         tasks = [ms for start, ms in starts_and_ms if start < opened + complete]
@@ -376,7 +386,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", type=Path, nargs="+", help=".hyrf files")
     parser.add_argument("--viewers", type=Path, required=True, help="folder in which npm has installed the viewers")
-    parser.add_argument("--repeats", type=int, default=3, help="number of visits of each page (3)")
+    parser.add_argument("--repeats", type=positive_integer, default=3, help="number of visits of each page (3)")
     parser.add_argument("--pictures", type=Path, help="folder for the pictures of the viewers")
     arguments = parser.parse_args()
     columns = [field.name.replace("_", " ") for field in fields(Measurement)]

@@ -31,7 +31,7 @@ from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from tools.browser.browser import Browser
 from tools.browser.chromium import Chromium
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import print_measured_table
 
@@ -156,8 +156,10 @@ def main() -> None:
     parser.add_argument("--sets", nargs="*", help="data sets to compare (all)")
     parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
     parser.add_argument("--large", type=Path, nargs="*", default=[], help="models to time")
-    parser.add_argument("--repeats", type=int, default=3, help="number of repeats of each time (3)")
+    parser.add_argument("--repeats", type=positive_integer, default=3, help="number of repeats of each time (3)")
     arguments = parser.parse_args()
+    if not arguments.runs and not arguments.large:
+        parser.error("nothing to measure; name --runs, --large or both")
     with tempfile.TemporaryDirectory() as folder:
         if arguments.runs:
             runs = [arguments.runs / name for name in arguments.sets or []] or sorted(

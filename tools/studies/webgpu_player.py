@@ -32,7 +32,7 @@ import numpy as np
 import hyrfpack
 from tools.browser.build_package import build_package
 from tools.browser.chromium import WEBGPU_FLAGS, Chromium
-from tools.command import run_command
+from tools.command import positive_integer, run_command
 from tools.studies.viewer_comparison import WINDOW_SIZE, Site
 from tools.studies.web_player import psnr
 from tools.tables import print_measured_table
@@ -111,7 +111,7 @@ def measure(address: str, kind: str, repeats: int, count: int) -> tuple[list[str
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", type=Path, nargs="+")
-    parser.add_argument("--repeats", type=int, default=5, help="repetitions of each work (5)")
+    parser.add_argument("--repeats", type=positive_integer, default=5, help="repetitions of each work (5)")
     arguments = parser.parse_args()
     columns = ["complete, s", "CPU, s", "colours, us", "frame, ms", "sort, ms", "PSNR, dB"]
     with tempfile.TemporaryDirectory() as name:
