@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
+import subprocess
 import sys
-from collections.abc import Callable
-from typing import NoReturn
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
 
 from hyrfpack.cli.wording import use_option_names
 from hyrfpack.errors import HyrfError
@@ -29,3 +31,16 @@ def run_command(main: Callable[[], int | None]) -> NoReturn:
     except HyrfError as error:
         print(f"error: {error.problem}; {use_option_names(error.fix)}", file=sys.stderr)
         sys.exit(2)
+
+
+def read_child_json(module: str, arguments: Sequence[object]) -> Any:
+    """Run a module in a process of its own; return the JSON value in the last line of its output.
+
+    Raises:
+        HyrfError: the process has failed. Its messages went to the standard error of this one.
+    """
+    command = [sys.executable, "-m", module, *map(str, arguments)]
+    process = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    if process.returncode:
+        raise HyrfError(f"{module} ended with exit code {process.returncode}", fix="see its messages above")
+    return json.loads(process.stdout.splitlines()[-1])

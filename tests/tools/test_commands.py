@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hyrfpack.errors import HyrfError
-from tools.command import run_command
+from tools.command import read_child_json, run_command
 from tools.safety import make_golden
 from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
 from tools.safety.train_golden import DEMO_MODEL_FILE, write_demo_photos
@@ -66,6 +66,14 @@ def test_a_tool_exits_with_its_code(code: int | None):
     with pytest.raises(SystemExit) as exit_info:
         run_command(lambda: code)
     assert exit_info.value.code == code
+
+
+def test_the_last_line_of_a_child_process_is_its_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "child.py").write_text("import sys\nprint('step 1')\nprint(sys.argv[1])\nsys.exit(len(sys.argv) - 2)")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    assert read_child_json("child", ["[4]"]) == [4]
+    with pytest.raises(HyrfError, match="child ended with exit code 1"):
+        read_child_json("child", [4, 5])
 
 
 def test_data_sets_are_folders_with_photos(tmp_path: Path):

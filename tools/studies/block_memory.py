@@ -15,8 +15,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -29,9 +27,9 @@ from hyrfpack.blocks import run as blocks_run
 from hyrfpack.cameras.placement import Placement
 from hyrfpack.data import PictureCache
 from hyrfpack.scene import Scene, evenly_spaced
-from tools.command import positive_integer, run_command
+from tools.command import positive_integer, read_child_json, run_command
 from tools.scenes.layout_city import BLOCKS_PER_SIDE, PITCH_METRES
-from tools.tables import markdown_table
+from tools.tables import markdown_row, markdown_table
 
 TRAINING_STEPS = 2
 MAX_SIDE_PIXELS = 160
@@ -116,11 +114,10 @@ def main() -> None:
     for tiles in arguments.tiles:
         for blocks in sorted({tiles, 1}):
             options = ["--tiles", tiles, "--child", blocks, "--photos", arguments.photos, "--points", arguments.points]
-            command = [sys.executable, "-m", "tools.studies.block_memory", arguments.folder, *options]
-            row = json.loads(subprocess.check_output(list(map(str, command))).splitlines()[-1])
+            row = read_child_json("tools.studies.block_memory", [arguments.folder, *options])
             memory = [f"{row[name]:,.0f}" for name in ("loaded", "trained", "peak")]
             rows.append([str(tiles), str(blocks), f"{row['largest']:,}", *memory])
-            print(rows[-1], flush=True)
+            print(markdown_row(rows[-1]), flush=True)
     print(markdown_table(TABLE_COLUMNS, rows))
 
 

@@ -39,10 +39,10 @@ from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.splats import concatenate
 from tools.command import positive_integer, run_command
+from tools.studies.levels import WALK_SEED, mean_psnr, measure_errors
 from tools.tables import markdown_table
 
 TARGETS_DB = (25, 30, 35)
-WALK_SEED = 77  # unlike the seeds of the views that `split_model` fits and measures at
 
 
 class Streamed(ABC):
@@ -139,16 +139,12 @@ def list_leaves(node: dict) -> list[dict]:
     return [leaf for child in node["children"] for leaf in list_leaves(child)] if "children" in node else [node]
 
 
-def measure_errors(
+def measure_choices(
     scene: Streamed, choices: Sequence[Sequence[int]], cameras: Sequence[Camera], targets: Sequence[torch.Tensor]
 ) -> list[float]:
-    """Return the mean squared error of each view."""
+    """Return the mean squared error of each view, whose chunks are at the chosen levels."""
     pictures = [scene.render(levels, camera) for levels, camera in zip(choices, cameras, strict=True)]
-    return [float((picture - target).square().mean()) for picture, target in zip(pictures, targets, strict=True)]
-
-
-def mean_psnr(errors: Sequence[float]) -> float:
-    return float(np.mean([psnr_from_mse(error) for error in errors]))
+    return measure_errors(pictures, targets)
 
 
 def measure_curve(
@@ -159,7 +155,7 @@ def measure_curve(
     total_count, budget = sum(counts[0] for counts in scene.counts), float(sum(counts[-1] for counts in scene.counts))
     while not curve or (curve[-1][0] < TARGETS_DB[-1] and budget < ratio * total_count):
         choices = [choose_levels(scene.counts, scene.predict(camera), budget)[0] for camera in cameras]
-        errors = measure_errors(scene, choices, cameras, targets)
+        errors = measure_choices(scene, choices, cameras, targets)
         curve.append((mean_psnr(errors), scene.count_bytes(choices)))
         print(f"  {budget:,.0f} Gaussians: {curve[-1][0]:.1f} dB, {curve[-1][1]:,} bytes", flush=True)
         budget *= ratio
@@ -181,7 +177,7 @@ def make_row(
     if isinstance(scene, SogScene):
         for level in range(len(scene.level_errors)):
             uniform = [[level] * len(scene.counts)] * len(cameras)
-            scene.level_errors[level] = float(np.mean(measure_errors(scene, uniform, cameras, targets)))
+            scene.level_errors[level] = float(np.mean(measure_choices(scene, uniform, cameras, targets)))
         psnr = f"{psnr_from_mse(scene.level_errors[0]):.1f}"
     else:
         psnr = "exact"

@@ -30,7 +30,7 @@ from hyrfpack.render.surface import render_median_depth
 from hyrfpack.scene import Camera, Scene, View
 from tools.command import run_command
 from tools.studies.trained_runs import load_runs, make_runs_parser
-from tools.tables import markdown_table
+from tools.tables import markdown_row, markdown_table
 
 MIN_PIXELS = 200  # Views that show less of the subject are left out.
 TABLE_COLUMNS = (
@@ -57,9 +57,9 @@ class Sphere:
         """Return the pixels (H, W) bool whose surface, at the median depth, lies in the sphere."""
         depth = _median_depth(model, camera)
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        local = np.stack(((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)), -1)
-        world = (local * depth[..., None] - camera.camera_from_world[:3, 3]) @ camera.rotation
-        return (depth > 0) & (np.linalg.norm(world - self.center, axis=-1) <= self.radius)
+        points = camera.unproject(x.ravel(), y.ravel(), depth.ravel())
+        distances = np.linalg.norm(points - self.center, axis=-1).reshape(depth.shape)
+        return (depth > 0) & (distances <= self.radius)
 
 
 def _median_depth(model: HybridModel, camera: Camera) -> np.ndarray:
@@ -134,7 +134,7 @@ def main() -> None:
     rows = []
     for name, model_file, scene in load_runs(arguments.runs, arguments.data, list(shares)):
         rows.append([name, f"{shares[name]:g}", *measure(model_file, scene, shares[name])])
-        print(rows[-1], flush=True)
+        print(markdown_row(rows[-1]), flush=True)
     print(markdown_table(TABLE_COLUMNS, rows))
 
 

@@ -26,7 +26,7 @@ from hyrfpack.scene import Camera, Scene
 from tools.command import run_command
 from tools.scenes.catalog import LAYOUTS, make_scene
 from tools.scenes.render import cast_pixels
-from tools.studies.mesh_error import compute_demo_depth, find_nearest_surface, format_statistics
+from tools.studies.mesh_error import compute_demo_depth, find_nearest_surface, format_statistics, make_rays
 from tools.tables import markdown_table
 
 MAX_DEMO_DEPTH = 6
@@ -106,12 +106,6 @@ def print_errors(model: HybridModel, cameras: list[Camera], geometry: Geometry) 
         joined = np.concatenate(parts)
         rows.append([name, *format_statistics(joined), f"{(joined < SMALL_ANGLE_DEGREES).mean():.3f}"])
     print(markdown_table(["normals, degrees", "mean", "median", "95 %", f"within {SMALL_ANGLE_DEGREES}"], rows))
-
-
-def make_rays(camera: Camera) -> np.ndarray:
-    """Return rays (H, W, 3), camera axes, whose length along the view axis is 1."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5 - camera.cx, np.arange(camera.height) + 0.5 - camera.cy)
-    return np.stack((x / camera.fx, y / camera.fy, np.ones(x.shape)), axis=-1)
 
 
 if __name__ == "__main__":

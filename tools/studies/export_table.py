@@ -34,9 +34,11 @@ from hyrfpack.splats.splats import Splats, concatenate
 from hyrfpack.splats.table import FORMATS
 from hyrfpack.web.html import decode_splats_page
 from tools.command import run_command
+from tools.tables import markdown_row, markdown_table
 
 TaskResult = TypeVar("TaskResult")
 
+TABLE_COLUMNS = ("format", "degree", "bytes", "write (s)", "read (s)", "dB, model", "dB, photos", "checked by")
 CHECKED_BY = {
     ".ply": "splat-transform, gsply, three.js",
     ".splat": "splat-transform, three.js",
@@ -76,8 +78,7 @@ def main() -> None:
     }
     model_scores = measure_scores(source, {})["model"]
     print(f"; the model itself: {arguments.model.stat().st_size:,} bytes, {model_scores.photos:.2f} dB on photos\n")
-    print("| format | degree | bytes | write (s) | read (s) | dB, model | dB, photos | checked by |")
-    print("|---|---|---|---|---|---|---|---|")
+    print(markdown_table(TABLE_COLUMNS, []))
     for name in formats:
         output_format = FORMATS.get(name.split()[0], HTML_PAGE)
         for degree in sorted({min(degree, output_format.max_degree) for degree in arguments.degrees}):
@@ -102,11 +103,8 @@ def print_row(
         data, write = time_second_call(lambda: splat_format.encode(splats_with_background[degree], hints))
         decoded, read = time_second_call(lambda: (splat_format.decode(data, name), None))
     file = measure_scores(source, {"file": decoded})["file"]
-    print(
-        f"| {name} | {degree} | {len(data):,} | {write:.2f} | {read:.2f} | {file.model:.2f} | {file.photos:.2f} "
-        f"| {CHECKED_BY[name]} |",
-        flush=True,
-    )
+    numbers = [f"{len(data):,}", *(f"{number:.2f}" for number in (write, read, file.model, file.photos))]
+    print(markdown_row([name, str(degree), *numbers, CHECKED_BY[name]]), flush=True)
 
 
 def measure_scores(source: Source, contenders: dict[str, tuple[Splats, np.ndarray | None]]) -> dict[str, PsnrScores]:

@@ -23,7 +23,7 @@ from tools.browser.frames import frame_observer_script
 from tools.command import run_command
 from tools.studies.scene_page import serve_scene
 from tools.studies.web_player import PAGE_TIMEOUT_SECONDS
-from tools.tables import markdown_table
+from tools.tables import markdown_row, markdown_table
 
 WINDOW_SIZE = (400, 266)
 BUDGET_SHARES = (1, 0.02, 1, 0.1, 1, 0.25, 1)
@@ -79,7 +79,7 @@ def measure(folder: Path) -> list[list[str]]:
             different = [psnr for psnr in neighbours if psnr < 60]
             cells = [f"{change:.1f}", str(len(different)), f"{min(neighbours, default=99):.1f}"]
             rows.append([folder.name, f"{budget:,}", f"{next_budget:,}", *cells])
-            print(rows[-1], flush=True)
+            print(markdown_row(rows[-1]), flush=True)
     return rows
 
 

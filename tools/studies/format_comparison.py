@@ -50,6 +50,7 @@ from hyrfpack.splats.table import FORMATS
 from tools.command import run_command
 from tools.json_files import write_json
 from tools.studies import gsplat_png
+from tools.tables import markdown_table
 
 # The settings with which each profile is measured; a profile without an entry uses its defaults.
 PROFILE_SETTINGS: dict[str, list[dict]] = {
@@ -224,20 +225,22 @@ class Measurements:
         drawable = Drawable.from_splats(splats, self.model.config.frame)
         return score_pictures((draw_over_background(drawable, view) for view in self.views), self.views)
 
-    def _row(
+    def _make_row(
         self, format_name: str, setting: str, size: int, count: int, scores: Sequence[float], degree: int | None = None
     ) -> MeasuredFile:
-        quality, structure, psnr_to_model = scores
-        drop_baked = None if degree is None else self.baked_psnr[degree] - quality
-        bits, drop = 8 * size / len(self.model), self.trained[0] - quality
+        photo_psnr, photo_ssim, psnr_to_model = scores
+        drop_baked = None if degree is None else self.baked_psnr[degree] - photo_psnr
+        bits, drop = 8 * size / len(self.model), self.trained[0] - photo_psnr
         return MeasuredFile(
-            format_name, setting, size, count, bits, quality, structure, drop, drop_baked, psnr_to_model
+            format_name, setting, size, count, bits, photo_psnr, photo_ssim, drop, drop_baked, psnr_to_model
         )
 
     def measure_peer(self, setting: PeerSetting) -> MeasuredFile:
         """Encode, decode, draw and score a file of another format."""
         size, decoded = setting.run(select_splats(self.baked[setting.degree], None, setting.min_opacity))
-        return self._row(setting.peer, str(setting), size, len(decoded), self.score_splats(decoded), setting.degree)
+        return self._make_row(
+            setting.peer, str(setting), size, len(decoded), self.score_splats(decoded), setting.degree
+        )
 
     def measure_own_file(self, path: Path, setting: str) -> MeasuredFile:
         """Load, render and score a `.hyrf` file."""
@@ -247,7 +250,7 @@ class Measurements:
             scores = score_pictures(
                 (render_view(model, view.camera, decoded=decoded).rgb for view in self.views), self.views
             )
-        return self._row(f"hyrfpack {profile}", setting, path.stat().st_size, len(model), scores)
+        return self._make_row(f"hyrfpack {profile}", setting, path.stat().st_size, len(model), scores)
 
 
 def compress_with_profiles(trained: Path, other_files: Sequence[Path], folder: Path) -> Iterator[tuple[Path, str]]:
@@ -282,18 +285,14 @@ def find_pareto_front(rows: Sequence[MeasuredFile]) -> list[MeasuredFile]:
 
 def format_table(rows: Sequence[MeasuredFile], trained: int) -> str:
     """Format the rows as a Markdown table; `trained` is the number of Gaussians of the trained model."""
-    lines = [
-        "| format | setting | Gaussians | bytes | bits/Gaussian "
-        "| PSNR | SSIM | drop, trained | drop, baked | PSNR, to the model |",
-        "|---|---|---|---|---|---|---|---|---|---|",
-    ]
+    columns = ("format", "setting", "Gaussians", "bytes", "bits/Gaussian", "PSNR", "SSIM")
+    table_rows = []
     for row in rows:
-        baked = "" if row.drop_baked is None else f"{row.drop_baked:.2f}"
-        lines.append(
-            f"| {row.format} | {row.setting} | {row.gaussians / trained:.0%} | {row.bytes:,} | {row.bits:.1f} | "
-            f"{row.psnr:.2f} | {row.ssim:.3f} | {row.drop_hybrid:.2f} | {baked} | {row.psnr_to_model:.1f} |"
-        )
-    return "\n".join(lines)
+        cells = [row.format, row.setting, f"{row.gaussians / trained:.0%}", f"{row.bytes:,}", f"{row.bits:.1f}"]
+        cells += [f"{row.psnr:.2f}", f"{row.ssim:.3f}", f"{row.drop_hybrid:.2f}"]
+        cells += ["" if row.drop_baked is None else f"{row.drop_baked:.2f}", f"{row.psnr_to_model:.1f}"]
+        table_rows.append(cells)
+    return markdown_table((*columns, "drop, trained", "drop, baked", "PSNR, to the model"), table_rows)
 
 
 def plot(rows: Sequence[MeasuredFile], trained: float, baked: float, title: str, path: Path) -> None:

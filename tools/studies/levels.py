@@ -30,13 +30,13 @@ from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Scene, evenly_spaced
 from tools.command import positive_integer, run_command
 from tools.studies.trained_runs import load_runs, make_runs_parser
-from tools.tables import markdown_table
+from tools.tables import markdown_row, markdown_table
 
 COMPACT_FILE = "compact.hyrf"
 BUDGETS = (0.1, 0.25, 0.5)
 RESOLUTIONS = (1.0, 1 / 4)
-PATH_VIEWS = 12
-PATH_SEED = 77  # unlike the seeds of the views that `split_model` fits and measures at
+MAX_COMPARED_VIEWS = 12
+WALK_SEED = 77  # unlike the seeds of the views that `split_model` fits and measures at
 FINEST_HEADER = (
     *("set", "Gaussians", "chunks", "bytes of the file", "bytes of the finest level", "bytes of all levels"),
     *("PSNR to the file", "photos, file", "photos, finest level"),
@@ -47,23 +47,25 @@ QUIET = hyrfpack.RunContext(progress=None)
 
 @torch.no_grad()
 def render_all(model: HybridModel, cameras: Sequence[Camera]) -> list[torch.Tensor]:
+    """Render the views of cameras; return their pictures (H, W, 3)."""
     return [hyrfpack.render_view(model, camera).rgb for camera in cameras]
 
 
-def compare(pictures: Sequence[torch.Tensor], others: Sequence[torch.Tensor]) -> list[float]:
+def measure_errors(pictures: Sequence[torch.Tensor], others: Sequence[torch.Tensor]) -> list[float]:
     """Return the mean squared error of each picture."""
     return [float((a - b).square().mean()) for a, b in zip(pictures, others, strict=True)]
 
 
 def mean_psnr(errors: Sequence[float]) -> float:
+    """Return the mean PSNR in dB of pictures with these mean squared errors."""
     return float(np.mean([psnr_from_mse(error) for error in errors]))
 
 
 def measure_finest(name: str, file: Path, folder: Path, scene: Scene, report: hyrfpack.SplitReport) -> list[str]:
     """Return the cells of a row of the first table."""
     model, finest = hyrfpack.load_model(file), hyrfpack.load_model(folder)
-    cameras = [view.camera for view in evenly_spaced(scene.test, PATH_VIEWS)]
-    psnr_to_model = mean_psnr(compare(render_all(model, cameras), render_all(finest, cameras)))
+    cameras = [view.camera for view in evenly_spaced(scene.test, MAX_COMPARED_VIEWS)]
+    psnr_to_model = mean_psnr(measure_errors(render_all(model, cameras), render_all(finest, cameras)))
     photos = [hyrfpack.evaluate_model(each, scene.test).psnr for each in (model, finest)]
     sizes = (report.bytes_source, report.bytes_finest, report.bytes)
     cells = [f"{size:,}" for size in sizes] + [f"{psnr_to_model:.1f}", *(f"{psnr:.3f}" for psnr in photos)]
@@ -73,17 +75,17 @@ def measure_finest(name: str, file: Path, folder: Path, scene: Scene, report: hy
 def measure_views(name: str, folder: Path, scene: Scene) -> list[list[str]]:
     """Return the rows of the second table."""
     levels, rows = hyrfpack.SceneFolder(folder), []
-    cameras = evenly_spaced(interpolate_views([view.camera for view in scene.train], PATH_SEED), PATH_VIEWS)
+    cameras = evenly_spaced(interpolate_views([view.camera for view in scene.train], WALK_SEED), MAX_COMPARED_VIEWS)
     finest, chunks = levels.load(), levels.manifest.chunks
     uniform = [levels.load([level] * len(chunks)) for level in range(len(chunks[0].levels))]
     for share in RESOLUTIONS:
         views = [resize_camera(camera, share) for camera in cameras]
         targets = render_all(finest, views)
-        by_level = [mean_psnr(compare(targets, render_all(model, views))) for model in uniform[1:]]
+        by_level = [mean_psnr(measure_errors(targets, render_all(model, views))) for model in uniform[1:]]
         for budget in BUDGETS:
             renderer = LevelRenderer(levels, gaussians=round(budget * len(finest)))
             drawn = [renderer.load(view) for view in views]
-            measured = compare(
+            measured = measure_errors(
                 targets, [render_all(model, [view])[0] for (model, _), view in zip(drawn, views, strict=True)]
             )
             pairs = [
@@ -107,7 +109,7 @@ def measure_views(name: str, folder: Path, scene: Scene) -> list[list[str]]:
                     alone,
                 ]
             )
-            print(rows[-1], flush=True)
+            print(markdown_row(rows[-1]), flush=True)
     return rows
 
 
@@ -125,7 +127,7 @@ def main() -> None:
                 file, folder, SplitConfig(arguments.chunk_gaussians), data=scene, context=QUIET
             )
             finest_rows.append(measure_finest(name, file, folder, scene, report))
-            print(finest_rows[-1], report.level_bytes, flush=True)
+            print(markdown_row(finest_rows[-1]), report.level_bytes, flush=True)
             view_rows += measure_views(name, folder, scene)
     print(markdown_table(FINEST_HEADER, finest_rows))
     print(markdown_table(VIEWS_HEADER, view_rows))

@@ -13,7 +13,6 @@ The results are in docs/research/sampling.md.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import hyrfpack
@@ -21,7 +20,7 @@ from tools.command import run_command
 from tools.studies.compare_versions import DEFAULT_SETS
 from tools.studies.reuse import describe_origin, remove_outdated
 from tools.studies.train_sets import make_study_parser
-from tools.tables import markdown_table
+from tools.tables import markdown_row, markdown_table
 
 PHOTO_REDUCTION = 2
 
@@ -64,10 +63,7 @@ def main() -> None:
             [sum(values) / len(seeds) for values in zip(*column, strict=True)] for column in zip(*seeds, strict=True)
         ]
         rows.append([name, *(f"{psnr:.2f}, {ssim:.3f}" for psnr, ssim in means)])
-        print(
-            json.dumps(dict(zip(("set", "half one", "half photos", "full one", "full photos"), rows[-1], strict=True))),
-            flush=True,
-        )
+        print(markdown_row(rows[-1]), flush=True)
     header = ["set", "half size, one pixel", "half size, photos", "full size, one pixel", "full size, photos"]
     print("\n" + markdown_table(header, rows))
 

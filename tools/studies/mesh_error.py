@@ -123,10 +123,15 @@ def find_nearest_surface(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return best, normals
 
 
+def make_rays(camera: Camera) -> np.ndarray:
+    """Return the ray (H, W, 3) of each pixel in camera axes; the depth of its end is 1."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5 - camera.cx, np.arange(camera.height) + 0.5 - camera.cy)
+    return np.stack((x / camera.fx, y / camera.fy, np.ones(x.shape)), axis=-1)
+
+
 def compute_demo_depth(camera: Camera) -> np.ndarray:
     """Return the depth (H, W) of the demo scene along the view axis; infinite in the sky."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5 - camera.cx, np.arange(camera.height) + 0.5 - camera.cy)
-    rays = np.stack((x / camera.fx, y / camera.fy, np.ones(x.shape)), axis=-1).reshape(-1, 3) @ camera.rotation
+    rays = make_rays(camera).reshape(-1, 3) @ camera.rotation
     lengths = np.linalg.norm(rays, axis=1)
     directions = np.ascontiguousarray((rays / lengths[:, None]).T, np.float32)
     origins = np.ascontiguousarray(np.broadcast_to(camera.position[:, None], directions.shape), np.float32)
@@ -174,9 +179,7 @@ def sample_visible_points(camera: Camera) -> np.ndarray:
     stride = max(1, round((depth.size / SURFACE_RAYS_PER_CAMERA) ** 0.5))
     rows, columns = np.nonzero(np.isfinite(depth[::stride, ::stride]))
     rows, columns = stride * rows, stride * columns
-    z = depth[rows, columns]
-    x, y = (columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z
-    return (np.stack((x, y, z), axis=1) - camera.camera_from_world[:3, 3]) @ camera.rotation
+    return camera.unproject(columns + 0.5, rows + 0.5, depth[rows, columns])
 
 
 def render_depths(source: Source, camera: Camera) -> dict[str, np.ndarray]:
@@ -210,7 +213,7 @@ def print_point_error(source: Source, mesh: Mesh, scene: Scene) -> None:
         tracks = scene.tracks[view.name]
         points = scene.points[tracks[is_in_export_box[tracks]]]
         u, v, z = view.camera.project(points)
-        inside = (z > 0) & (u >= 0) & (v >= 0) & (u < view.camera.width) & (v < view.camera.height)
+        inside = view.camera.in_picture(u, v, z)
         rows, columns, z = v[inside].astype(int), u[inside].astype(int), z[inside]
         depths = {"mesh": draw_depth(mesh, view.camera), **render_depths(source, view.camera)}
         for name, depth in depths.items():

@@ -30,7 +30,7 @@ from hyrfpack.model import Frame, HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.scene import Camera
 from tools.command import positive_integer, run_command
-from tools.tables import markdown_table
+from tools.tables import markdown_row, markdown_table
 
 BALL_RADIUS = 1.0
 BALL_CENTERS = np.array([[0.0, 0.0, 1.0], [2.6, 0.0, 1.0], [-2.6, 0.0, 1.0], [0.0, 2.6, 1.0], [0.0, -2.6, 1.0]])
@@ -54,7 +54,7 @@ def main() -> None:
         write_model(model, count, arguments.seed)
         for ending in arguments.endings:
             rows.append([f"{count:,}", ending, *measure(model, model.with_suffix(ending))])
-            print(rows[-1], flush=True)
+            print(markdown_row(rows[-1]), flush=True)
     head = ["Gaussians", "export", "triangles", "wall time", "CPU time", "peak memory", "error: median, 95 %"]
     print(markdown_table(head, rows))
     print(f"load averages of 1, 5 and 15 minutes at the end: {os.getloadavg()}")

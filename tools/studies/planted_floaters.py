@@ -28,7 +28,7 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.scene import Camera, evenly_spaced
 from tools.command import run_command
 from tools.studies.trained_runs import load_runs, make_runs_parser
-from tools.tables import markdown_table
+from tools.tables import markdown_row, markdown_table
 
 PLANTING_VIEWS = 24
 NEAR_DEPTHS, FREE_DEPTHS = (0.08, 0.3), (0.3, 0.8)
@@ -80,9 +80,7 @@ def _random_floaters(
         free = np.where(covered[pixel], depth[pixel], median) * generator.uniform(*FREE_DEPTHS, len(part))
         is_near = np.arange(len(part)) < len(part) // 2
         z = np.where(is_near, median * generator.uniform(*NEAR_DEPTHS, len(part)), free)
-        local = np.stack(((x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z), axis=1)
-        world = (local - camera.camera_from_world[:3, 3]) @ camera.rotation
-        positions.append(world)
+        positions.append(camera.unproject(x, y, z))
         near_masks.append(is_near)
     frame = model.config.frame
     placed = (np.concatenate(positions) - np.array(frame.center)) / frame.scale
@@ -134,7 +132,7 @@ def main() -> None:
             counts = [f"{int(mask.sum()):,}" for mask in (is_planted, removed)]
             row = [name, f"{len(model):,}", *counts, *ratio_cells, *(f"{score:.2f}" for score in (psnr, *scores))]
             rows.append(row)
-            print(row, flush=True)
+            print(markdown_row(row), flush=True)
     header = ["set", "Gaussians", "planted", "removed", "recall", "precision", "dB", "dB planted", "dB removed"]
     print(markdown_table(header, rows))
 

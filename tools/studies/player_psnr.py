@@ -96,8 +96,8 @@ def draw_moving(browser: Browser, camera: Camera, factor: int) -> np.ndarray:
 def measure_page(browser: Browser, model: Path, views: int, factor: int, enlarge: int) -> list[str]:
     """Return the row of a model whose page is open."""
     cameras = [cut_camera(enlarge_camera(camera, enlarge), factor) for camera in read_stored_cameras(model, views)]
-    field = hyrfpack.load_merged_model(model)
-    exact = render_exact(field, cameras)
+    loaded = hyrfpack.load_merged_model(model)
+    exact = render_exact(loaded, cameras)
     still = [psnr(draw_in_page(browser, camera), picture) for camera, picture in zip(cameras, exact, strict=True)]
     browser.evaluate(MOVING_SCRIPT % factor)
     table = [still]
@@ -106,7 +106,7 @@ def measure_page(browser: Browser, model: Path, views: int, factor: int, enlarge
         pictures = [draw_moving(browser, camera, factor) for camera in cameras]
         table.append([psnr(*pair) for pair in zip(pictures, (reduce_picture(p, factor) for p in exact), strict=True)])
     cells = [f"{statistic(scores):.1f}" for scores in table for statistic in (statistics.mean, min)]
-    return [f"{model.parent.name}/{model.name}", f"{len(field):,}", str(enlarge), *cells]
+    return [f"{model.parent.name}/{model.name}", f"{len(loaded):,}", str(enlarge), *cells]
 
 
 def main() -> None:

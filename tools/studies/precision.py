@@ -48,6 +48,7 @@ from tools.command import run_command
 from tools.json_files import write_json
 from tools.studies.reuse import describe_origin
 from tools.studies.train_sets import make_study_parser
+from tools.tables import markdown_row, markdown_table
 
 MLP_LOOKUPS = ("hyrfpack.model.field.mlp", "hyrfpack.ops.background.reference.mlp")
 # The module attribute through which hyrfpack calls each operation.
@@ -126,7 +127,7 @@ def main() -> None:
     ).parse_args()
     scores_file = args.out / "scores.json"
     scores = json.loads(scores_file.read_text()) if scores_file.exists() else {}
-    print("| set | row | PSNR | against float32 | SSIM | Gaussians | seconds |\n|---|---|---|---|---|---|---|")
+    print(markdown_table(("set", "row", "PSNR", "against float32", "SSIM", "Gaussians", "seconds"), []), flush=True)
     for name in args.sets:
         scene = hyrfpack.load_scene(args.data / name)
         origin = describe_origin(args.data / name, steps=args.steps)
@@ -144,11 +145,8 @@ def main() -> None:
                 scores[key]["origin"] = origin
                 write_json(scores_file, scores)
             score, base = scores[key], scores[f"{name}, {BASELINE_ROW}, {args.steps}"]["psnr"]
-            print(
-                f"| {name} | {row} | {score['psnr']:.3f} | {score['psnr'] - base:+.3f} | {score['ssim']:.4f} | "
-                f"{score['gaussians']:,} | {score['seconds']:.0f} |",
-                flush=True,
-            )
+            cells = [name, row, f"{score['psnr']:.3f}", f"{score['psnr'] - base:+.3f}", f"{score['ssim']:.4f}"]
+            print(markdown_row([*cells, f"{score['gaussians']:,}", f"{score['seconds']:.0f}"]), flush=True)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from hyrfpack.errors import HyrfError
 from tools.command import positive_integer, run_command
 from tools.studies.reuse import describe_origin, remove_outdated
 from tools.studies.train_sets import DATA_FOLDER
@@ -27,14 +28,20 @@ from tools.tables import markdown_table
 
 
 def train(data: Path, out: Path, processes: int, options: Sequence[str]) -> dict:
-    """Train with several processes unless this version has made the run; return its metrics."""
+    """Train with several processes unless this version has made the run; return its metrics.
+
+    Raises:
+        HyrfError: training failed. Its messages went to standard error.
+    """
     remove_outdated(out, describe_origin(data, processes=processes, options=list(options)))
     if not (out / "metrics.json").exists():
         command = [sys.executable, "-m", "hyrfpack", "train", str(data), "-o", str(out), "--processes", str(processes)]
         environment = {**os.environ, "HYRFPACK_THREADS": "1", "OMP_NUM_THREADS": "1"}
-        subprocess.run(
-            [*command, *options, "--overwrite", "--quiet"], check=True, env=environment, stdout=subprocess.DEVNULL
-        )
+        command += [*options, "--overwrite", "--quiet"]
+        process = subprocess.run(command, check=False, env=environment, stdout=subprocess.DEVNULL)
+        if process.returncode:
+            problem = f"{data}: training with {processes} processes ended with exit code {process.returncode}"
+            raise HyrfError(problem, fix="see its messages above")
     return json.loads((out / "metrics.json").read_text())
 
 

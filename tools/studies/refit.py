@@ -32,7 +32,7 @@ from hyrfpack.edit.refit import REFIT_RATES, refit_region, score_region
 from hyrfpack.model import HybridModel
 from tools.command import positive_integer, run_command
 from tools.studies.trained_runs import load_runs, make_runs_parser
-from tools.tables import markdown_table
+from tools.tables import markdown_row, markdown_table
 
 REGION_SHARE = 0.1
 MOVE_PER_RADIUS = 0.05
@@ -112,7 +112,7 @@ def main() -> None:
                     scores = ["", "", ""] if psnrs is None else [f"{psnr:.2f}" for psnr in psnrs]
                     row = [name, f"{is_selected.sum():,}", kind, str(steps), f"{factor:g}", *scores, f"{seconds:.0f}"]
                     rows.append(row)
-                    print(row, flush=True)
+                    print(markdown_row(row), flush=True)
     header = ["set", "Gaussians", "damage", "steps", "rates", "dB", "dB damaged", "dB refit", "seconds"]
     print(markdown_table(header, rows))
 

@@ -17,7 +17,6 @@ import argparse
 import dataclasses
 import json
 import statistics
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -31,7 +30,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.scene import Camera, Picture, Scene, View, evenly_spaced
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.log import peak_memory
-from tools.command import positive_integer, run_command
+from tools.command import positive_integer, read_child_json, run_command
 from tools.tables import markdown_table
 
 MAX_PHOTOS = 8
@@ -100,11 +99,9 @@ def main(arguments: list[str] | None = None) -> None:
         return
     rows = []
     for count in options.gaussians:
-        command = [sys.executable, "-m", "tools.studies.step_cost", "--one", "--gaussians", str(count)]
-        command += ["--data", str(options.data), "--model", str(options.model), "--steps", str(options.steps)]
-        command += ["--size", *map(str, options.size)]
-        process = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-        costs = json.loads(process.stdout.splitlines()[-1])
+        child_options = ["--one", "--gaussians", count, "--data", options.data, "--model", options.model]
+        child_options += ["--steps", options.steps, "--size", *options.size]
+        costs = read_child_json("tools.studies.step_cost", child_options)
         print(count, costs, file=sys.stderr)
         rows.append(
             [

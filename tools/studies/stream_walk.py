@@ -39,7 +39,7 @@ from tools.command import positive_integer, run_command
 from tools.studies.large_model import COUNT_TEXTURES_SCRIPT
 from tools.studies.scene_page import serve_scene
 from tools.studies.web_player import PAGE_TIMEOUT_SECONDS, read_stored_cameras
-from tools.tables import markdown_table
+from tools.tables import markdown_row, markdown_table
 
 WINDOW_SIZE = (640, 400)
 POLL_SECONDS = 0.5
@@ -144,14 +144,14 @@ def main() -> None:
         with serve_scene(folder, arguments.budget) as address:
             result = walk(address, stops, arguments.rest)
         rows.append(make_row(folder.name, count, None, result))
-        print(rows[-1], flush=True)
+        print(markdown_row(rows[-1]), flush=True)
     for file in arguments.unsplit:
         with tempfile.TemporaryDirectory() as temporary:
             page = Path(temporary, "page.html")
             hyrfpack.export_model(file, page)
             result = walk(page.as_uri(), read_stored_cameras(file, arguments.stops), arguments.rest)
             rows.append(make_row(file.name, len(hyrfpack.load_merged_model(file)), page.stat().st_size, result))
-        print(rows[-1], flush=True)
+        print(markdown_row(rows[-1]), flush=True)
     print(markdown_table(TABLE_COLUMNS, rows))
 
 

@@ -55,8 +55,8 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.scene import Camera
 from tools.browser.chromium import Chromium
 from tools.command import positive_integer, run_command
-from tools.studies.web_player import EXACT_SETTINGS, psnr
-from tools.tables import format_cell, markdown_table
+from tools.studies.web_player import EXACT_SETTINGS, orbit_with_mouse, psnr
+from tools.tables import format_cell, markdown_row, markdown_table
 
 WINDOW_SIZE = (1280, 800)
 VERTICAL_FOV_DEGREES = 50.0
@@ -65,7 +65,6 @@ FIRST_PICTURE_DETAIL = 0.5  # share of the standard deviation of the final pictu
 SAME_PICTURE_DB = 40.0  # of two frames of the screen recording, whose pictures are scaled down
 STILL_SECONDS = 8.0  # a page whose screen has not changed for this long is complete
 PAGE_TIMEOUT_SECONDS = 300.0
-ORBIT_SECONDS = 6.0
 REPOSITORY_ROOT = Path(__file__).parents[2]
 DECODER_FOLDER = REPOSITORY_ROOT / "hyrfpack" / "web" / "hyrf"
 ESBUILD_PROGRAM = REPOSITORY_ROOT / "tests" / "node" / "node_modules" / ".bin" / "esbuild"  # after `make player`
@@ -364,11 +363,8 @@ def measure_frame_cpu_ms(browser: Chromium) -> float:
     """Return the CPU milliseconds of the browser for each frame that is drawn while a mouse orbits."""
     x, y = WINDOW_SIZE[0] / 2, WINDOW_SIZE[1] / 2
     browser.button_down(x, y)
-    first_frame, cpu, started, step = browser.evaluate("drawnFrames"), browser.cpu_seconds(), time.perf_counter(), 0
-    while time.perf_counter() < started + ORBIT_SECONDS:
-        step += 1
-        browser.move(x + 3 * (step % 60), y)
-        time.sleep(0.02)
+    first_frame, cpu = browser.evaluate("drawnFrames"), browser.cpu_seconds()
+    orbit_with_mouse(browser, x, y)
     frames, cpu = browser.evaluate("drawnFrames") - first_frame, browser.cpu_seconds() - cpu
     browser.button_up(x, y)
     return 1000 * cpu / max(1, frames)
@@ -414,7 +410,7 @@ def main() -> None:
                 for field in fields(Measurement)
             ]
             rows.append([f"{len(loaded):,}", viewer_name, *(format_cell(value) for value in medians)])
-            print(rows[-1], flush=True)
+            print(markdown_row(rows[-1]), flush=True)
     print(markdown_table(["Gaussians", "viewer", *columns], rows))
 
 

@@ -84,9 +84,9 @@ def measure_pictures(run: Path, data: Path, folder: Path) -> list[str]:
     model = run / "compact.hyrf"
     scene = hyrfpack.load_scene(data)
     views = evenly_spaced(scene.test, COMPARED_VIEWS)
-    field = hyrfpack.load_model(model)
-    model_pictures = [hyrfpack.render_view(field, view.camera).rgb.clamp(0, 1).numpy() for view in views]
-    solid = np.array(field.config.solid, np.float32)
+    loaded = hyrfpack.load_model(model)
+    model_pictures = [hyrfpack.render_view(loaded, view.camera).rgb.clamp(0, 1).numpy() for view in views]
+    solid = np.array(loaded.config.solid, np.float32)
     photos = [view.load().composite(solid) for view in views]
     scores: dict[str, list[float]] = {}
     cells = [run.name, f"{model.stat().st_size:,}"]
@@ -113,16 +113,22 @@ def measure_pictures(run: Path, data: Path, folder: Path) -> list[str]:
     return cells
 
 
+def orbit_with_mouse(browser: Browser, x: float, y: float) -> None:
+    """Move the mouse for ORBIT_SECONDS from a point in pixels, at which its button is down."""
+    started, step = time.perf_counter(), 0
+    while time.perf_counter() < started + ORBIT_SECONDS:
+        step += 1
+        browser.move(x + 3 * (step % 60), y)
+        time.sleep(0.02)
+
+
 def measure_frame_ms(browser: Browser) -> float:
     """Return the milliseconds per frame at full resolution while a mouse orbits."""
     browser.evaluate("document.getElementById('automatic').checked && document.getElementById('automatic').click()")
     x, y = WINDOW_SIZE[0] / 2, WINDOW_SIZE[1] / 2
     browser.button_down(x, y)
-    first_frame, started, step = browser.evaluate("hyrfpack.frames()"), time.perf_counter(), 0
-    while time.perf_counter() < started + ORBIT_SECONDS:
-        step += 1
-        browser.move(x + 3 * (step % 60), y)
-        time.sleep(0.02)
+    first_frame, started = browser.evaluate("hyrfpack.frames()"), time.perf_counter()
+    orbit_with_mouse(browser, x, y)
     frames, seconds = browser.evaluate("hyrfpack.frames()") - first_frame, time.perf_counter() - started
     browser.button_up(x, y)
     return 1000 * seconds / max(1, frames)
