@@ -61,7 +61,7 @@ def main() -> None:
     parser.add_argument(
         "runs", nargs="+", type=Path, help="folders of runs, with compact.hyrf and the name of a data set"
     )
-    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("-o", "--output", type=Path, required=True, help="the picture")
     parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
     args = parser.parse_args()
     rows = []

@@ -89,8 +89,8 @@ def main() -> None:
     parser.add_argument("--model", type=Path, help="start from this model of the scene instead of training one")
     parser.add_argument("--steps", type=positive_integer, default=1500, help="training steps before splitting (1,500)")
     parser.add_argument("--final-steps", type=int, default=60, help="training steps after splitting (60)")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seed", type=int, default=0, help="random seed (0)")
+    parser.add_argument("--out", type=Path, required=True, help="folder for model.hyrf")
     args = parser.parse_args()
 
     start = time.perf_counter()

@@ -44,7 +44,7 @@ Geometry = Callable[[Camera], tuple[np.ndarray, np.ndarray]]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kind", choices=("demo", *LAYOUTS))
+    parser.add_argument("kind", choices=("demo", *LAYOUTS), help="the scene of known geometry")
     parser.add_argument("model", type=Path, help="a .hyrf file")
     parser.add_argument("--photos", type=Path, required=True, help="folder of the model's photos")
     arguments = parser.parse_args()

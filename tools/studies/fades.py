@@ -4,8 +4,8 @@
 
 The camera of a scene folder stands still, and the budget of Gaussians changes between a fiftieth, a tenth, a quarter
 and all of them. Each step of a fade is as long as on a slow device. For each change the table has the PSNR in dB of the
-pictures before and after it, the number of frames between them that differ, and the least PSNR of two neighbouring
-frames.
+pictures before and after it, the number of frames that differ from the one before (by a PSNR below 60 dB), and the
+lowest PSNR of two neighbouring frames.
 
 The results are in docs/research/levels.md.
 """
@@ -28,6 +28,8 @@ from tools.tables import markdown_row, markdown_table
 WINDOW_SIZE = (400, 266)
 BUDGET_SHARES = (1, 0.02, 1, 0.1, 1, 0.25, 1)
 POLL_SECONDS = 0.2
+QUIET_POLLS = 10  # The answer of the worker may take a while.
+MIN_EQUAL_FRAMES_PSNR_DB = 60.0
 # Compares each frame with the one before.
 COMPARE_FRAMES_SCRIPT = """(() => {
   const psnr = (a, b) => {
@@ -54,10 +56,10 @@ def change_budget(browser: Browser, budget: int) -> list[float]:
     browser.evaluate("comparedFrames.begin()")
     loader = "hyrfpack.player.loader"
     browser.evaluate(f"({loader}.gaussians = {budget}, {loader}.post({{ gaussians: {budget} }}))")
-    still = 0
-    while still < 10:  # the answer of the worker may take a while
+    quiet_polls = 0
+    while quiet_polls < QUIET_POLLS:
         time.sleep(POLL_SECONDS)
-        still = still + 1 if browser.evaluate(IS_DONE_SCRIPT % budget) else 0
+        quiet_polls = quiet_polls + 1 if browser.evaluate(IS_DONE_SCRIPT % budget) else 0
     return browser.evaluate("comparedFrames.end()")
 
 
@@ -76,7 +78,7 @@ def measure(folder: Path) -> list[list[str]]:
         browser.evaluate("hyrfpack.player.settled.then(() => true)")
         for budget, next_budget in zip(budgets, budgets[1:], strict=False):
             change, *neighbours = change_budget(browser, next_budget)
-            different = [psnr for psnr in neighbours if psnr < 60]
+            different = [psnr for psnr in neighbours if psnr < MIN_EQUAL_FRAMES_PSNR_DB]
             cells = [f"{change:.1f}", str(len(different)), f"{min(neighbours, default=99):.1f}"]
             rows.append([folder.name, f"{budget:,}", f"{next_budget:,}", *cells])
             print(markdown_row(rows[-1]), flush=True)

@@ -72,9 +72,11 @@ def main() -> None:
     parser.add_argument(
         "--steps", type=positive_integer, nargs="+", default=[1000, 3000], help="steps of each column (1,000 and 3,000)"
     )
-    parser.add_argument("--folds", type=int, default=1, choices=range(1, VALIDATION_EVERY + 1))
+    parser.add_argument(
+        "--folds", type=int, default=1, choices=range(1, VALIDATION_EVERY + 1), help="number of folds (1)"
+    )
     parser.add_argument("--no-exposure", dest="exposure", action="store_false", help="learn no per-image gains")
-    parser.add_argument("--data", type=Path, default=DATA_FOLDER)
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
     parser.add_argument(
         "--out", type=Path, default=Path("runs/few_photos.json"), help="file for all scores, also those of other calls"
     )

@@ -338,7 +338,7 @@ def main() -> None:
     parser.add_argument("model", type=Path, help="a trained model.hyrf")
     parser.add_argument("data", type=Path, help="the folder it was trained on")
     parser.add_argument("--ours", type=Path, nargs="*", default=[], help="further compressed .hyrf files to measure")
-    parser.add_argument("--formats", nargs="*", choices=PEER_FORMATS, default=PEER_FORMATS)
+    parser.add_argument("--formats", nargs="*", choices=PEER_FORMATS, default=PEER_FORMATS, help="other formats (all)")
     parser.add_argument("--out", type=Path, help="folder for results (runs/peers/<name of the data folder>)")
     args = parser.parse_args()
     out = args.out or Path("runs/peers") / args.data.name

@@ -122,10 +122,16 @@ def count_rows(model: HybridModel, scene: Scene) -> tuple[float, ...]:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--data", type=Path, required=True, help="a data set")
     parser.add_argument("--model", type=Path, required=True, help="a model of that data set")
-    parser.add_argument("--gaussians", type=positive_integer, nargs="+", default=[20_000, 200_000])
-    parser.add_argument("--steps", type=positive_integer, default=40)
+    parser.add_argument(
+        "--gaussians",
+        type=positive_integer,
+        nargs="+",
+        default=[20_000, 200_000],
+        help="numbers of Gaussians (20,000 200,000)",
+    )
+    parser.add_argument("--steps", type=positive_integer, default=40, help="steps of each order (40)")
     options = parser.parse_args(arguments)
     scene = hyrfpack.load_scene(options.data)
     scene = dataclasses.replace(scene, train=scene.train[:MAX_PHOTOS], test=[])

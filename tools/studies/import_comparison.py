@@ -182,8 +182,10 @@ def main() -> None:
         metavar="DB",
         help="PSNR targets of hyrfpack's files",
     )
-    parser.add_argument("--size", type=int, default=ImportConfig.size)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--size", type=int, default=ImportConfig.size, help=f"longer side of pictures in pixels ({ImportConfig.size})"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="random seed (0)")
     args = parser.parse_args()
     for file in args.files:
         compare_file(file, ImportConfig(size=args.size, seed=args.seed), args.psnr)

@@ -55,7 +55,7 @@ def measure(browser: Browser, model: Path, page: Path) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", type=Path, nargs="+")
+    parser.add_argument("models", type=Path, nargs="+", help=".hyrf files")
     arguments = parser.parse_args()
 
     def measure_model(model: Path) -> Iterator[list[str]]:

@@ -116,7 +116,9 @@ def measure_views(name: str, folder: Path, scene: Scene) -> list[list[str]]:
 def main() -> None:
     parser = make_runs_parser(__doc__ or "")
     parser.add_argument("--sets", nargs="+", help="data sets; default: all below --runs")
-    parser.add_argument("--chunk-gaussians", type=positive_integer, default=2048)
+    parser.add_argument(
+        "--chunk-gaussians", type=positive_integer, default=2048, help="the most Gaussians of a chunk (2,048)"
+    )
     arguments = parser.parse_args()
     finest_rows, view_rows = [], []
     for name, model_file, scene in load_runs(arguments.runs, arguments.data, arguments.sets):

@@ -165,7 +165,13 @@ def format_table(rows: list[dict]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=positive_integer, nargs="+", default=[1000, 3000, 7000, 15000, 30000])
+    parser.add_argument(
+        "--steps",
+        type=positive_integer,
+        nargs="+",
+        default=[1000, 3000, 7000, 15000, 30000],
+        help="numbers of training steps (1000 3000 7000 15000 30000)",
+    )
     parser.add_argument("--sets", nargs="+", help="folders below --data, or variants (`set_variants.py`); default: all")
     parser.add_argument(
         "--seeds", type=positive_integer, default=1, help="number of seeds for each data set and number of steps (1)"
@@ -176,8 +182,8 @@ def main() -> None:
         help="learn per-image gains or not (default: pilot runs decide)",
     )
     parser.add_argument("--finetune", type=int, default=0, help="steps of fine-tuning a further file; 0 for none (0)")
-    parser.add_argument("--data", type=Path, default=DATA_FOLDER)
-    parser.add_argument("--out", type=Path, default=Path("runs/long"))
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
+    parser.add_argument("--out", type=Path, default=Path("runs/long"), help="folder for runs (runs/long)")
     parser.add_argument("--table", action="store_true", help="only print the table")
     args = parser.parse_args()
     if args.table:

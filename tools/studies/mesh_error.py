@@ -54,7 +54,7 @@ HIT_LIMIT = 0.02  # world units of the demo scene, about the size of a pixel
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kind", choices=("demo", "points"))
+    parser.add_argument("kind", choices=("demo", "points"), help="what the mesh is compared with")
     parser.add_argument("model", type=Path, help="a .hyrf file")
     parser.add_argument("--photos", type=Path, required=True, help="folder of the model's photos")
     parser.add_argument("--voxel", type=float, help="side of a voxel, world units")

@@ -44,8 +44,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("counts", type=positive_integer, nargs="+", help="numbers of Gaussians")
     parser.add_argument("--endings", nargs="+", default=[".mesh.ply", ".collision.obj"], help="what to export")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("runs/mesh_scale"))
+    parser.add_argument("--seed", type=int, default=0, help="random seed (0)")
+    parser.add_argument("--out", type=Path, default=Path("runs/mesh_scale"), help="folder for models (runs/mesh_scale)")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     rows = []

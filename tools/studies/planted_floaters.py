@@ -113,8 +113,13 @@ def main() -> None:
     parser = make_runs_parser(__doc__ or "")
     parser.add_argument("--sets", nargs="*", help="data sets (all below --runs)")
     parser.add_argument("--shares", type=float, nargs="+", default=[0, 0.05, 0.15], help="shares of planted Gaussians")
-    parser.add_argument("--min-opacity-share", type=float, default=DEFAULT_MIN_OPACITY_SHARE)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--min-opacity-share",
+        type=float,
+        default=DEFAULT_MIN_OPACITY_SHARE,
+        help=f"as in hyrfpack edit --remove-floaters ({DEFAULT_MIN_OPACITY_SHARE})",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="random seed (0)")
     arguments = parser.parse_args()
     rows = []
     for name, model_file, scene in load_runs(arguments.runs, arguments.data, arguments.sets):

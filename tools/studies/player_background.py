@@ -53,7 +53,7 @@ def measure_model(browser: Chromium, page: Path, repeats: int) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", type=Path, nargs="+")
+    parser.add_argument("models", type=Path, nargs="+", help=".hyrf files")
     parser.add_argument("--repeats", type=positive_integer, default=5, help="evaluations with each spacing (5)")
     arguments = parser.parse_args()
     columns = ["model", "pixels between nodes", "each pixel, ms", "nodes, ms", "ratio"]

@@ -111,7 +111,7 @@ def measure_page(browser: Browser, model: Path, views: int, factor: int, enlarge
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", type=Path, nargs="+")
+    parser.add_argument("models", type=Path, nargs="+", help=".hyrf files")
     parser.add_argument("--views", type=positive_integer, default=8, help="number of views of each model (8)")
     parser.add_argument(
         "--factor", type=positive_integer, default=2, help="moving frames have 1/N of the resolution (2)"

@@ -64,12 +64,14 @@ def format_row(name: str, processes: int, metrics: dict, baseline_processes: int
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=DATA_FOLDER)
-    parser.add_argument("--sets", nargs="+", required=True)
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
+    parser.add_argument("--sets", nargs="+", required=True, help="folders below --data")
     parser.add_argument("--steps", type=positive_integer, default=2000, help="photos of all processes together (2,000)")
-    parser.add_argument("--processes", type=positive_integer, nargs="+", default=[1, 2, 4])
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("runs/processes"))
+    parser.add_argument(
+        "--processes", type=positive_integer, nargs="+", default=[1, 2, 4], help="numbers of processes (1 2 4)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="random seed (0)")
+    parser.add_argument("--out", type=Path, default=Path("runs/processes"), help="folder for runs (runs/processes)")
     options = parser.parse_args(arguments)
     rows = []
     for name in options.sets:

@@ -85,11 +85,19 @@ def scale_rates(rates: LearningRates, factor: float) -> LearningRates:
 def main() -> None:
     parser = make_runs_parser(__doc__ or "")
     parser.add_argument("--sets", nargs="*", help="data sets (all below --runs)")
-    parser.add_argument("--kinds", nargs="+", choices=SHUFFLED_NAMES, default=list(SHUFFLED_NAMES))
-    parser.add_argument("--steps", type=positive_integer, nargs="+", default=[DEFAULT_REFIT_STEPS])
-    parser.add_argument("--factors", type=float, nargs="+", default=[1.0])
+    parser.add_argument(
+        "--kinds", nargs="+", choices=SHUFFLED_NAMES, default=list(SHUFFLED_NAMES), help="damages (all)"
+    )
+    parser.add_argument(
+        "--steps",
+        type=positive_integer,
+        nargs="+",
+        default=[DEFAULT_REFIT_STEPS],
+        help=f"steps of the refit ({DEFAULT_REFIT_STEPS})",
+    )
+    parser.add_argument("--factors", type=float, nargs="+", default=[1.0], help="factors of all learning rates (1)")
     parser.add_argument("--held-out", action="store_true", help="score held-out photos")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="random seed (0)")
     arguments = parser.parse_args()
     rows = []
     for name, model_file, scene in load_runs(arguments.runs, arguments.data, arguments.sets):

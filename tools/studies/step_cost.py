@@ -82,13 +82,19 @@ def measure_steps(scene: Scene, model: HybridModel, steps: int) -> dict:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--data", type=Path, required=True, help="a data set")
     parser.add_argument("--model", type=Path, required=True, help="a model of that data set with many Gaussians")
     parser.add_argument(
-        "--gaussians", type=positive_integer, nargs="+", default=[50_000, 200_000, 1_000_000, 3_000_000]
+        "--gaussians",
+        type=positive_integer,
+        nargs="+",
+        default=[50_000, 200_000, 1_000_000, 3_000_000],
+        help="numbers of Gaussians (50,000 200,000 1,000,000 3,000,000)",
     )
-    parser.add_argument("--size", type=int, nargs=2, default=[800, 600])
-    parser.add_argument("--steps", type=positive_integer, default=16)
+    parser.add_argument(
+        "--size", type=int, nargs=2, default=[800, 600], help="width and height of the photos in pixels (800 600)"
+    )
+    parser.add_argument("--steps", type=positive_integer, default=16, help="training steps (16)")
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.one:

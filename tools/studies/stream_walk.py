@@ -135,7 +135,7 @@ def main() -> None:
     parser.add_argument("folders", type=Path, nargs="+", help="scene folders")
     parser.add_argument("--unsplit", type=Path, nargs="*", default=[], help=".hyrf files, drawn by a page as they are")
     parser.add_argument("--budget", type=int, default=250_000, help="the most Gaussians to draw (250,000)")
-    parser.add_argument("--stops", type=positive_integer, default=8)
+    parser.add_argument("--stops", type=positive_integer, default=8, help="cameras at which the walk rests (8)")
     parser.add_argument("--rest", type=float, default=10.0, help="seconds at each stop (10)")
     arguments = parser.parse_args()
     rows = []

@@ -158,11 +158,11 @@ def make_study_parser(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=positive_integer, default=1000)
+    parser.add_argument("--steps", type=positive_integer, default=1000, help="training steps (1,000)")
     parser.add_argument("--sets", nargs="*", help="folders below --data, or variants (`set_variants.py`); default: all")
-    parser.add_argument("--data", type=Path, default=DATA_FOLDER)
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
+    parser.add_argument("--out", type=Path, help="folder for runs (runs/sets/<steps>)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed (0)")
     parser.add_argument(
         "--exposure",
         action=argparse.BooleanOptionalAction,

@@ -54,7 +54,7 @@ def main() -> None:
         "--lengths", type=float, nargs=2, default=(3.0, 10.0), help="shortest and longest blur in pixels (3 10)"
     )
     parser.add_argument("--quality", type=int, default=18, help="H.264's constant rate factor (18)")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="random seed (0)")
     parser.add_argument("--train", action="store_true", help="also estimate poses and train")
     parser.add_argument("--steps", type=positive_integer, default=1000, help="training steps (1,000)")
     args = parser.parse_args()

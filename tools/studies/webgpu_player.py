@@ -110,7 +110,7 @@ def measure(address: str, kind: str, repeats: int, count: int) -> tuple[list[str
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", type=Path, nargs="+")
+    parser.add_argument("models", type=Path, nargs="+", help=".hyrf files")
     parser.add_argument("--repeats", type=positive_integer, default=5, help="repetitions of each work (5)")
     arguments = parser.parse_args()
     columns = ["complete, s", "CPU, s", "colours, us", "frame, ms", "sort, ms", "PSNR, dB"]
