@@ -188,3 +188,9 @@ def test_versions_of_triton_are_compared_kernel_by_kernel() -> None:
 def test_every_kernel_is_built(report: dict[str, list]) -> None:
     assert report["builds"]
     assert report["left_out"] == []
+
+
+def test_a_folder_without_triton_is_not_compared(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tools.gpu.build", "--compare", str(tmp_path)]
+    done = subprocess.run(command, cwd=REPOSITORY_ROOT, capture_output=True, text=True)
+    assert done.returncode == 2 and "there is no Triton" in done.stderr

@@ -44,7 +44,7 @@ from tools.gpu import tests as gpu_tests
 from tools.gpu import timing as gpu_timing
 from tools.gpu.compare import check_call
 from tools.gpu.process import SECONDS_TO_END, TimedProcess
-from tools.gpu.rows import goal_row
+from tools.gpu.rows import make_goal_row
 from tools.gpu.scene import TIDY_LOOK, TRAINED_LOOK, Look, decode_splats, make_cameras, make_model
 from tools.gpu.setup import Setup, find_dataset
 from tools.gpu.worker import failure_row, find_missing_package
@@ -226,7 +226,7 @@ def test_wrong_gradients_fail_the_backward_row_alone(monkeypatch: pytest.MonkeyP
         return x if implementation == "reference" else 2 * x - x.detach()  # right values, gradients of 2 in place of 1
 
     call = OperationCall(scale, {"x": torch.linspace(1, 2, 5)}, ("x",), (1e-2, 1e-2))
-    monkeypatch.setattr(gpu_kernels, "median_ms", lambda *_: {"forward": 1.0, "backward": 1.0})
+    monkeypatch.setattr(gpu_kernels, "measure_median_ms", lambda *_: {"forward": 1.0, "backward": 1.0})
     works = (gpu_roofline.Work(1.0, 1.0),) * 2
     forward, backward = gpu_kernels._measure_passes("scale", "5 numbers", call, works, TINY_SETUP, call)
     assert "status" not in forward and forward["value error"] == 0.0
@@ -360,8 +360,8 @@ def test_the_page_has_goals_failures_and_a_table_for_each_kind(tmp_path: Path) -
     rows = [
         {"part": "kernels", "item": "a", "table": "Kernels", "kernel": "a|b", "ms": 0.5, "pairs": 1_234_567},
         {"part": "kernels", "item": "b", "status": "failed", "note": "RuntimeError: no"},
-        {"part": "frames", "item": "1", **goal_row("frames", 312.0, 300.0, "frames/s", at_least=True)},
-        {"part": "frames", "item": "1", **goal_row("steps", 12.0, 10.0, "min", at_least=False)},
+        {"part": "frames", "item": "1", **make_goal_row("frames", 312.0, 300.0, "frames/s", at_least=True)},
+        {"part": "frames", "item": "1", **make_goal_row("steps", 12.0, 10.0, "min", at_least=False)},
     ]
     page = tmp_path / "new" / "nvidia-h200.md"
     gpu_report.write_report(page, {"device": "NVIDIA H200", "torch": "2.11"}, {"width": 1920}, rows)
@@ -393,6 +393,13 @@ def test_without_a_gpu_it_ends_with_a_clear_error_and_code_2(capsys: pytest.Capt
     assert capsys.readouterr().err == f"tools.gpu.check: {gpu_check.NO_GPU}\n"
 
 
+def test_a_named_folder_without_data_is_not_replaced_by_another_set(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    with pytest.raises(SystemExit) as exit_info:
+        gpu_check.main(["--data", str(tmp_path)])
+    assert exit_info.value.code == 2 and f"--data {tmp_path}: there is no data set" in capsys.readouterr().err
+
+
 def test_it_starts_from_the_repository_root_without_an_installed_hyrfpack() -> None:
     # -S excludes the environment's packages, and with them an installed hyrfpack; torch is found where it is.
     environment = {**os.environ, "PYTHONPATH": str(Path(torch.__file__).parents[1])}
@@ -413,7 +420,7 @@ def test_rooms_of_the_goals_size_come_first_as_trained_before_tidy() -> None:
 
 def test_a_check_of_some_parts_leaves_the_full_report_as_it_is() -> None:
     names = [
-        gpu_check.report_path(Path("out"), "NVIDIA H200", parts).as_posix()
+        gpu_check.choose_report_path(Path("out"), "NVIDIA H200", parts).as_posix()
         for parts in (gpu_check.DEFAULT_PARTS, gpu_check.DEFAULT_PARTS[::-1], ["ranks", "quality"], ["quality"])
     ]
     full = "out/nvidia-h200.md"
@@ -528,7 +535,7 @@ def test_a_slow_sanitizer_keeps_what_it_found_and_leaves_time_for_the_next_tool(
 
 
 def test_races_are_checked_in_all_operations_whose_kernels_multiply_matrices() -> None:
-    assert gpu_sanitizer.product_operations() == {"mlp", "shade", "background_grid", "rasterize_shaded"}
+    assert gpu_sanitizer.list_product_operations() == {"mlp", "shade", "background_grid", "rasterize_shaded"}
 
 
 def test_the_sanitizers_tools_and_pytest_keep_their_own_limits_within_those_of_their_parts() -> None:
@@ -611,7 +618,7 @@ def test_the_sanitizer_is_left_out_where_it_is_missing(monkeypatch: pytest.Monke
 
 
 def test_prepared_commands_run_the_default_parts_and_both_kinds_of_training() -> None:
-    first, second, third = gpu_prepare.check_commands(Path("build/gpu/bonsai"), "abc123", "$OUT")
+    first, second, third = gpu_prepare.list_check_commands(Path("build/gpu/bonsai"), "abc123", "$OUT")
     assert all("--commit abc123 --out $OUT" in command for command in (first, second, third))
     assert "--parts" not in first
     assert "--parts quality ranks --data build/gpu/bonsai" in second
@@ -685,7 +692,7 @@ def test_a_full_run_needs_a_data_set() -> None:
     (item,) = gpu_full_run.items(TINY_SETUP)
     (row,) = gpu_full_run.run(item, TINY_SETUP)
     assert row["status"] == "left out" and "--data" in row["note"]
-    seconds = gpu_check.part_seconds("full-run", replace(TINY_SETUP, full_run_seconds=100.0))
+    seconds = gpu_check.choose_time_limit("full-run", replace(TINY_SETUP, full_run_seconds=100.0))
     assert seconds == 100.0 + gpu_check.FULL_RUN_OVERHEAD_SECONDS
 
 

@@ -41,7 +41,7 @@ import torch
 
 from hyrfpack.measure.machine import format_machine
 from hyrfpack.parallel.child_items import run_in_children
-from tools.gpu.report import describe_gpu_machine, file_name, write_report
+from tools.gpu.report import describe_gpu_machine, make_file_name, write_report
 from tools.gpu.rows import Row
 from tools.gpu.setup import FULL_RUN_SECONDS, Setup, find_dataset
 from tools.gpu.worker import failure_row, run_child
@@ -88,7 +88,7 @@ def check(
     rows: list[Row] = []
     for part in parts:
         start = time.monotonic()
-        for row in run_part(part, setup, scale * part_seconds(part, setup), scale * ITEM_SECONDS.get(part, inf)):
+        for row in run_part(part, setup, scale * choose_time_limit(part, setup), scale * ITEM_SECONDS.get(part, inf)):
             rows.append({"part": part, **row})
             print(_format_row(rows[-1]), flush=True)
             report(rows)
@@ -98,7 +98,7 @@ def check(
     return rows
 
 
-def part_seconds(part: str, setup: Setup) -> float:
+def choose_time_limit(part: str, setup: Setup) -> float:
     """Return the time limit of a part in seconds."""
     return CHECK_PARTS[part][1] + (setup.full_run_seconds if part == "full-run" else 0.0)
 
@@ -126,14 +126,14 @@ def run_child_items(part: str, setup: Setup, items: Sequence[str]) -> int:
     return run_child(lambda item: module.run(item, setup), items, lambda: is_usable(setup.torch_device))
 
 
-def report_path(folder: Path, device: str, parts: Sequence[str]) -> Path:
+def choose_report_path(folder: Path, device: str, parts: Sequence[str]) -> Path:
     """Return the page of a check, named by the machine and by its parts unless they are the default ones.
 
     So a check of some parts leaves the machine's full report as it is.
     """
     chosen = [part for part in CHECK_PARTS if part in parts]
     suffix = [] if chosen == list(DEFAULT_PARTS) else chosen
-    return folder / f"{'-'.join([file_name(device), *suffix])}.md"
+    return folder / f"{'-'.join([make_file_name(device), *suffix])}.md"
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -172,7 +172,7 @@ def main(arguments: list[str] | None = None) -> int:
     setup = replace(setup, commit=str(facts["commit"]))
     print(format_machine(facts), flush=True)
 
-    page = report_path(args.out, str(facts["device"]), args.parts)
+    page = choose_report_path(args.out, str(facts["device"]), args.parts)
 
     def report(rows: Sequence[Row]) -> None:
         write_report(page, facts, asdict(setup), rows)

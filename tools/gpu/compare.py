@@ -26,12 +26,12 @@ def check_passes(call: OperationCall, implementation: str) -> tuple[dict[str, ob
     gradient_error = largest_relative_error(gradients, exact_gradients)
     value_bound, gradient_bound = call.error_bounds
     return (
-        {"value error": value_error} | status_beyond(value_error, value_bound),
-        {"gradient error": gradient_error} | status_beyond(gradient_error, gradient_bound),
+        {"value error": value_error} | make_bound_status(value_error, value_bound),
+        {"gradient error": gradient_error} | make_bound_status(gradient_error, gradient_bound),
     )
 
 
-def status_beyond(error: float, bound: float) -> dict[str, object]:
+def make_bound_status(error: float, bound: float) -> dict[str, object]:
     """Return the "failed" status of a row whose error exceeds its bound, otherwise an empty dictionary."""
     if error <= bound:
         return {}

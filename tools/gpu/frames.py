@@ -14,7 +14,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
-from tools.gpu.rows import Row, goal_row, kernel_rows
+from tools.gpu.rows import Row, make_goal_row, make_kernel_rows
 from tools.gpu.scene import (
     TIDY_LOOK,
     TRAINED_LOOK,
@@ -27,7 +27,7 @@ from tools.gpu.scene import (
     perturb,
 )
 from tools.gpu.setup import GOAL_ROOM_NAME, Setup
-from tools.gpu.timing import median_ms, profile_task, read_peak_memory_mb, reset_peak_memory, synchronize
+from tools.gpu.timing import measure_median_ms, profile_task, read_peak_memory_mb, reset_peak_memory, synchronize
 from tools.gpu.worker import failure_row
 
 GOAL_FRAMES_PER_SECOND, GOAL_GSPLAT_SPEED_RATIO = 300.0, 0.8
@@ -108,12 +108,12 @@ def _frame_rows(room: str, model: HybridModel, cameras: list[Camera], setup: Set
                 "peak MB": read_peak_memory_mb(device),
             }
             if name == "decoded once" and room == GOAL_ROOM_NAME:
-                yield goal_row(
+                yield make_goal_row(
                     f"frames of {room} Gaussians", 1e3 / ms, GOAL_FRAMES_PER_SECOND, "frames/s", at_least=True
                 )
         decoded = model.decode()
         times = profile_task(lambda: render_view(model, cameras[1], decoded=decoded), 5, device).times
-    yield from kernel_rows(times, f"A frame of {room} Gaussians: kernels on the device")
+    yield from make_kernel_rows(times, f"A frame of {room} Gaussians: kernels on the device")
 
 
 def _frame_ms(draw: Callable[[Camera], object], cameras: list[Camera], setup: Setup) -> float:
@@ -142,13 +142,13 @@ def _rasterizer_rows(room: str, splats: Splats, setup: Setup) -> Iterator[Row]:
     calls = {name: OperationCall(draw, splats.inputs, tuple(splats.inputs)) for name, draw in draws.items()}
     tasks = {f"{name} forward": call.forward_task("auto") for name, call in calls.items()}
     tasks |= {f"{name} forward and backward": call.forward_backward_task("auto") for name, call in calls.items()}
-    times = median_ms(tasks, setup.repeats, setup.torch_device)
+    times = measure_median_ms(tasks, setup.repeats, setup.torch_device)
     for pass_name in ("forward", "forward and backward"):
         hyrfpack_ms, gsplat_ms = times[f"hyrfpack {pass_name}"], times.get(f"gsplat {pass_name}")
         cells = {"pass": pass_name, "ms": hyrfpack_ms, "gsplat ms": gsplat_ms}
         yield row | cells | ({"speed over gsplat's": gsplat_ms / hyrfpack_ms} if gsplat_ms else {})
         if gsplat_ms and room == GOAL_ROOM_NAME:
-            yield goal_row(
+            yield make_goal_row(
                 f"rasterising {room}, {pass_name}",
                 gsplat_ms / hyrfpack_ms,
                 GOAL_GSPLAT_SPEED_RATIO,

@@ -27,7 +27,7 @@ from hyrfpack.ops.shade import Shading, shade
 from hyrfpack.ops.viewport import Viewport
 from hyrfpack.render import RenderSettings
 from tools.gpu import roofline
-from tools.gpu.compare import check_call, check_passes, largest_relative_error, relative_error, status_beyond
+from tools.gpu.compare import check_call, check_passes, largest_relative_error, make_bound_status, relative_error
 from tools.gpu.roofline import Work
 from tools.gpu.rows import Row
 from tools.gpu.scene import (
@@ -41,7 +41,7 @@ from tools.gpu.scene import (
     make_model,
 )
 from tools.gpu.setup import Setup
-from tools.gpu.timing import group_kernels, measure_rates, median_ms, profile_task
+from tools.gpu.timing import group_kernels, measure_median_ms, measure_rates, profile_task
 
 TABLE_NAME = "Kernels"
 BACKGROUND_STRIDE = 2
@@ -160,13 +160,13 @@ def measure_decode(setup: Setup) -> Iterator[Row]:
         "geometry": lambda: model.decode_geometry(),
         "radiance": lambda: model.decode_colors(viewpoint),
     }
-    times = median_ms(tasks, setup.repeats, setup.torch_device)
+    times = measure_median_ms(tasks, setup.repeats, setup.torch_device)
     for name, field in list_named_fields(model):
         widths = [field.weights[0].shape[1], *(weight.shape[0] for weight in field.weights)]
         mixed = model.precision == "mixed"
         work = roofline.count_decode(len(model), widths, field.grid.config.levels, field.grid.config.rows, mixed)
         row = _row(f"decode {name}", "forward", f"{len(model):,} Gaussians", times[name], work, setup)
-        yield row | {"value error": errors[name]} | status_beyond(errors[name], 1e-2)
+        yield row | {"value error": errors[name]} | make_bound_status(errors[name], 1e-2)
 
 
 @torch.no_grad()
@@ -178,7 +178,7 @@ def measure_shade(setup: Setup) -> Iterator[Row]:
     ours = setup.implementation
     for precision, shading in _shadings(model).items():
         task = {"shade": lambda shading=shading: shade(positions, viewpoint, shading, implementation=ours)}
-        ms = median_ms(task, setup.repeats, setup.torch_device)["shade"]
+        ms = measure_median_ms(task, setup.repeats, setup.torch_device)["shade"]
         part, exact = _shading_sample(shading, setup), _shading_sample(shading, setup, torch.float64)
         sample = _sample(positions, setup)
         error = relative_error(
@@ -187,7 +187,7 @@ def measure_shade(setup: Setup) -> Iterator[Row]:
         )
         work = roofline.count_shade(len(positions), _widths(shading), shading.mixed)
         row = _row(f"shade, {precision}", "forward", f"{len(positions):,} Gaussians", ms, work, setup)
-        yield row | {"value error": error} | status_beyond(error, 3e-3 if shading.mixed else 1e-4)
+        yield row | {"value error": error} | make_bound_status(error, 3e-3 if shading.mixed else 1e-4)
 
 
 def _shadings(model: HybridModel) -> dict[str, Shading]:
@@ -245,7 +245,7 @@ def measure_rasterize_shaded(setup: Setup) -> Iterator[Row]:
 
         raster = draw()
         pairs, visible_count = int(raster.pairs), int(raster.visible.sum())
-        ms = median_ms({"draw": draw}, setup.repeats, setup.torch_device)["draw"]
+        ms = measure_median_ms({"draw": draw}, setup.repeats, setup.torch_device)["draw"]
         project = roofline.count_project_shaded(len(model), visible_count, _widths(shading), shading.mixed)
         # The decoder's arithmetic and the blending's run on different units, so only the decoder's own row counts it.
         total_work = Work(project.bytes, 0) + roofline.count_bin_pairs(visible_count, pairs, tiles)
@@ -255,7 +255,7 @@ def measure_rasterize_shaded(setup: Setup) -> Iterator[Row]:
         error = relative_error(join_color_and_transmittance(draw(viewport)), join_color_and_transmittance(expected))
         size = f"{len(model):,} Gaussians, {visible_count:,} visible, {pairs:,} pairs, {setup.width} x {setup.height}"
         row = _row(f"rasterize shaded, {precision}", "forward", size, ms, total_work, setup)
-        yield row | {"value error": error} | status_beyond(error, 3e-3 if shading.mixed else 1e-3)
+        yield row | {"value error": error} | make_bound_status(error, 3e-3 if shading.mixed else 1e-3)
         stages = group_kernels(profile_task(draw, 5, setup.torch_device).times, STAGE_KERNEL_WORDS, "bin")
         if stages["project"]:
             yield _row("- project and shade", "forward", size, stages["project"], project, setup)
@@ -281,11 +281,11 @@ def measure_background(setup: Setup) -> Iterator[Row]:
         mixed = on_gpu and precision == "mixed"
         actual = model.background_grid(light, splats.viewport, **options)
         task = {"grid": lambda: model.background_grid(light, splats.viewport, **options)}
-        ms = median_ms(task, setup.repeats, setup.torch_device)["grid"]
+        ms = measure_median_ms(task, setup.repeats, setup.torch_device)["grid"]
         work = roofline.count_background(light.numel(), nodes, needed, widths, grid.levels, grid.rows, mixed)
         error = relative_error(actual, expected)
         row = _row(f"background, {'mixed' if mixed else 'float32'}", "forward", size, ms, work, setup)
-        yield row | {"value error": error} | status_beyond(error, 1e-2 if mixed else 1e-3)
+        yield row | {"value error": error} | make_bound_status(error, 1e-2 if mixed else 1e-3)
 
 
 def measure_ssim(setup: Setup) -> Iterator[Row]:
@@ -298,9 +298,9 @@ def measure_ssim(setup: Setup) -> Iterator[Row]:
     pictures = [tensor.contiguous().to(setup.device) for tensor in ((smooth + noise).clamp(0, 1), smooth)]
 
     call = make_loss_call(*pictures)
-    ms = median_ms({"both": call.forward_backward_task(setup.implementation)}, setup.repeats, setup.torch_device)[
-        "both"
-    ]
+    ms = measure_median_ms(
+        {"both": call.forward_backward_task(setup.implementation)}, setup.repeats, setup.torch_device
+    )["both"]
     size_text = f"{setup.width} x {setup.height}"
     work = roofline.count_photometric_loss(setup.width * setup.height)
     yield _row("SSIM and L1 loss", "both", size_text, ms, work, setup) | check_call(call, setup.implementation)
@@ -321,9 +321,9 @@ def measure_adam(setup: Setup) -> Iterator[Row]:
     error = relative_error(*results)
     groups = [[state.to(setup.device)] for state in states]
     task = {"step": lambda: adam_step(*groups, **settings, implementation=setup.implementation)}
-    ms = median_ms(task, setup.repeats, setup.torch_device)["step"]
+    ms = measure_median_ms(task, setup.repeats, setup.torch_device)["step"]
     row = _row("Adam", "step", f"{count:,} numbers", ms, roofline.count_adam(count), setup)
-    yield row | {"value error": error} | status_beyond(error, 1e-5)
+    yield row | {"value error": error} | make_bound_status(error, 1e-5)
 
 
 def _measure_passes(
@@ -331,7 +331,7 @@ def _measure_passes(
 ) -> Iterator[Row]:
     """Yield the rows of both passes of a call; the errors are those of `part`, a smaller call."""
     tasks = dict(zip(("forward", "backward"), call.separate_tasks(setup.implementation), strict=True))
-    times = median_ms(tasks, setup.repeats, setup.torch_device)
+    times = measure_median_ms(tasks, setup.repeats, setup.torch_device)
     for (pass_name, ms), work, cells in zip(
         times.items(), works, check_passes(part, setup.implementation), strict=True
     ):

@@ -69,7 +69,7 @@ def is_same_scene(first: Scene, second: Scene) -> bool:
     )
 
 
-def check_commands(data: Path, commit: str, out: str) -> list[str]:
+def list_check_commands(data: Path, commit: str, out: str) -> list[str]:
     """Return the commands for the GPU machine: the default parts, then short and long training.
 
     Args:
@@ -81,12 +81,12 @@ def check_commands(data: Path, commit: str, out: str) -> list[str]:
     return [check, *(f"{check} --parts {parts} --data {data.as_posix()}" for parts in ("quality ranks", "full-run"))]
 
 
-def folder_bytes(folder: Path) -> int:
+def measure_folder_bytes(folder: Path) -> int:
     """Return the size of all files below a folder."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
-def tree_bytes() -> int:
+def measure_tree_bytes() -> int:
     """Return the size of the files of the repository that git knows."""
     listed = _git("ls-files", "-z").split("\0")
     return sum(path.stat().st_size for path in (REPOSITORY_ROOT / name for name in listed if name) if path.is_file())
@@ -108,14 +108,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         shutil.rmtree(folder, ignore_errors=True)
         folder.parent.mkdir(parents=True, exist_ok=True)
         Path(temporary, "copy").rename(folder)
-    megabytes = (folder_bytes(folder) + tree_bytes()) / 2**20
-    print(f"{args.folder}: {folder_bytes(folder) / 2**20:.1f} MiB; with the repository {megabytes:.1f} MiB")
+    megabytes = (measure_folder_bytes(folder) + measure_tree_bytes()) / 2**20
+    print(f"{args.folder}: {measure_folder_bytes(folder) / 2**20:.1f} MiB; with the repository {megabytes:.1f} MiB")
     if megabytes > MAX_MEGABYTES:
         print(f"tools.gpu.prepare: that is more than {MAX_MEGABYTES:.0f} MiB; use a smaller data set", file=sys.stderr)
         return 1
     print("On the GPU machine, in the repository's root, one command each:")
     commit = _git("describe", "--always", "--dirty", "--abbrev=12").strip()
-    for command in check_commands(args.folder / args.data.name, commit, args.out):
+    for command in list_check_commands(args.folder / args.data.name, commit, args.out):
         print(f"    {command}")
     return 0
 

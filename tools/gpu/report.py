@@ -30,7 +30,7 @@ def describe_gpu_machine(device: torch.device, commit: str | None = None) -> dic
         device: the device that is measured.
         commit: the commit of this copy of the repository; None asks git.
     """
-    facts: dict[str, object] = {"device": device_name(device)}
+    facts: dict[str, object] = {"device": read_device_name(device)}
     if device.type == "cuda":
         properties = torch.cuda.get_device_properties(device)
         facts["memory GB"] = round(properties.total_memory / 1e9, 1)
@@ -62,12 +62,12 @@ def _query_nvidia_smi() -> dict[str, object]:
     return dict(zip(names, values, strict=True)) if len(values) == len(names) else {}
 
 
-def device_name(device: torch.device) -> str:
+def read_device_name(device: torch.device) -> str:
     """Return the driver's name of the GPU, or the processor type for a CPU."""
     return torch.cuda.get_device_name(device) if device.type == "cuda" else f"{platform.machine()} CPU"
 
 
-def file_name(name: str) -> str:
+def make_file_name(name: str) -> str:
     """Return a device's name as a file name without ending: "NVIDIA H200" becomes "nvidia-h200"."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 

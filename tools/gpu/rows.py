@@ -13,7 +13,7 @@ Row = dict[str, object]
 MAX_KERNEL_ROWS = 15
 
 
-def goal_row(name: str, measured: float, target: float, unit: str, *, at_least: bool) -> Row:
+def make_goal_row(name: str, measured: float, target: float, unit: str, *, at_least: bool) -> Row:
     """Return a row that compares a measured number with its goal; a missed goal does not fail the check."""
     met = measured >= target if at_least else measured <= target
     sign = "at least" if at_least else "at most"
@@ -21,7 +21,7 @@ def goal_row(name: str, measured: float, target: float, unit: str, *, at_least: 
     return row | {"met": "yes" if met else "no"}
 
 
-def kernel_rows(times: Mapping[str, float], table: str) -> Iterator[Row]:
+def make_kernel_rows(times: Mapping[str, float], table: str) -> Iterator[Row]:
     """Yield rows of the kernels that take longest on the device: milliseconds and share of the total."""
     total = sum(times.values())
     for name, ms in list(times.items())[:MAX_KERNEL_ROWS]:

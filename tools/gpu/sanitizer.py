@@ -40,7 +40,7 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
         }
         return
     cases = list_self_test_cases()
-    names = [name for name, case in cases.items() if item == "memcheck" or case.operation in product_operations()]
+    names = [name for name, case in cases.items() if item == "memcheck" or case.operation in list_product_operations()]
     worker = [sys.executable, "-m", "hyrfpack.self_test.worker", setup.implementation, f"{setup.device}:0", *names]
     # torch's cache of memory would hide accesses between two tensors.
     environment = {**child_environment(), "PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}
@@ -57,7 +57,7 @@ def run(item: str, setup: Setup) -> Iterator[Row]:
         yield row | describe_output(output, process.exit_code, len(names))
 
 
-def product_operations() -> set[str]:
+def list_product_operations() -> set[str]:
     """Return the operations whose kernels multiply matrices, through shared memory: those with mixed precision."""
     return {case.operation for case in list_self_test_cases().values() if case.is_mixed}
 

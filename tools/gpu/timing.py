@@ -41,7 +41,9 @@ def synchronize(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-def median_ms(tasks: Mapping[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, float]:
+def measure_median_ms(
+    tasks: Mapping[str, Callable[[], object]], repeats: int, device: torch.device
+) -> dict[str, float]:
     """Return the median milliseconds of each task; the tasks alternate.
 
     On a GPU the time is that between two CUDA events, after warm-up runs and each time after a cache flush. On a CPU it
@@ -95,7 +97,7 @@ def measure_rates(device: torch.device) -> Rates:
     tf32 = torch.backends.cuda.matmul.allow_tf32
     torch.backends.cuda.matmul.allow_tf32 = False
     try:
-        times = median_ms(
+        times = measure_median_ms(
             {
                 "copy": lambda: target.copy_(source),
                 "bf16": lambda: half @ half,

@@ -12,7 +12,7 @@ from hyrfpack.measure.psnr import psnr_from_mse
 from hyrfpack.model import HybridModel
 from hyrfpack.scene import Scene
 from hyrfpack.train import TrainConfig, Trainer
-from tools.gpu.rows import Row, goal_row, kernel_rows
+from tools.gpu.rows import Row, make_goal_row, make_kernel_rows
 from tools.gpu.setup import GOAL_ROOM_NAME, Setup
 from tools.gpu.timing import Profile, profile_task, read_peak_memory_mb, reset_peak_memory, synchronize
 
@@ -66,9 +66,9 @@ class TimedTraining:
             "host's time": ", ".join(f"{stage} {seconds / total:.0%}" for stage, seconds in self.stages.items()),
         }
         if self.room == GOAL_ROOM_NAME:
-            yield goal_row(f"30,000 steps of {self.room} Gaussians", minutes, GOAL_MINUTES, "min", at_least=False)
+            yield make_goal_row(f"30,000 steps of {self.room} Gaussians", minutes, GOAL_MINUTES, "min", at_least=False)
         kernels = {name: ms / PROFILED_STEPS for name, ms in self.profile.times.items()}
-        yield from kernel_rows(kernels, f"A training step of {self.room} Gaussians: kernels on the device")
+        yield from make_kernel_rows(kernels, f"A training step of {self.room} Gaussians: kernels on the device")
 
     def _format_launches(self) -> str | None:
         if not self.profile.times:
