@@ -150,9 +150,12 @@ def fake_training(monkeypatch):
     monkeypatch.setattr(hyrfpack, "load_scene", lambda path, **options: scene)
     monkeypatch.setattr(hyrfpack, "evaluate_model", lambda model, views: scores)
     monkeypatch.setattr(train_sets, "load_variant", lambda data, name: scene)
-    monkeypatch.setattr(
-        processes.subprocess, "run", lambda command, **options: train(None, Path(command[command.index("-o") + 1]))
-    )
+
+    def run(command, **options):
+        train(None, Path(command[command.index("-o") + 1]))
+        return SimpleNamespace(returncode=0)
+
+    monkeypatch.setattr(processes.subprocess, "run", run)
     return trained
 
 

@@ -100,7 +100,9 @@ def test_estimated_poses_keep_the_results_of_other_calls(tmp_path, monkeypatch):
 
     monkeypatch.setattr(estimated_poses, "measure", measure)
     for name in "ab":
-        monkeypatch.setattr(sys, "argv", ["estimated_poses", "--sets", name, "--out", str(tmp_path)])
+        (tmp_path / "scenes" / name / "sparse").mkdir(parents=True)
+        arguments = ["--sets", name, "--scenes", str(tmp_path / "scenes"), "--out", str(tmp_path)]
+        monkeypatch.setattr(sys, "argv", ["estimated_poses", *arguments])
         estimated_poses.main()
     assert [row["set"] for row in json.loads((tmp_path / "table.json").read_text())] == ["a", "b"]
 
