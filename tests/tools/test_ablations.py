@@ -81,7 +81,9 @@ def test_a_run_trains_exactly_the_groups_of_its_variant(name):
     # New rows begin as copies, so a value counts as moved if it did not exist before.
     moved = {group_of(key) for key, p in after.items() if not torch.isin(p.detach(), before[key]).all()}
     assert moved == GROUPS_BY_VARIANT[name]
-    assert {group_of(key) for key, p in after.items() if p.requires_grad} == GROUPS_BY_VARIANT[name]
+    # Density control reads the gradients of opacity logits, also of those that stay zero.
+    with_gradients = {group_of(key) for key, p in after.items() if p.requires_grad}
+    assert with_gradients == GROUPS_BY_VARIANT[name] | {"opacity_logits"}
     assert all(parameter.isfinite().all() for parameter in after.values())
 
 
@@ -94,6 +96,14 @@ def test_missing_logits_stay_zero(name):
         values = getattr(trainer.model.gaussians, logits)
         assert len(values) == len(trainer.model) > 60
         assert not values.any()
+
+
+def test_density_control_scores_gaussians_without_opacity_logits():
+    trainer = make_trainer(
+        "no explicit opacity", dataclasses.replace(SHORT_CONFIG, steps=4, density=DensityConfig(start=0.9))
+    )
+    trainer.run()
+    assert (trainer.strategy.squares > 0).float().mean() > 0.5
 
 
 @pytest.mark.parametrize("name", [name for name in VARIANTS_BY_NAME if VARIANTS_BY_NAME[name].missing_logits])

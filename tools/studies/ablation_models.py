@@ -151,7 +151,11 @@ def evaluate_harmonics_to_degree_3(directions: Tensor) -> Tensor:
 
 
 class OptimizerWithoutLogits(Optimizer):
-    """Adam for a model that lacks some explicit logits; these stay zero, also for new Gaussians."""
+    """Adam for a model that lacks some explicit logits; these stay zero, also for new Gaussians.
+
+    Density control scores the importance of Gaussians by the gradients of opacity logits. So these are computed even if
+    the opacity logits are missing, and cleared before each step.
+    """
 
     def __init__(self, model: HybridModel, rates: LearningRates, missing_logits: tuple[str, ...]) -> None:
         super().__init__(model, rates, warmup_steps=FIELD_WARMUP_STEPS)
@@ -159,10 +163,15 @@ class OptimizerWithoutLogits(Optimizer):
         for name in missing_logits:
             self.reset(name, torch.zeros_like(getattr(model.gaussians, name)))
 
+    def step(self, step: int, steps: int, enabled: Tensor | None = None) -> Tensor:
+        for name in self.missing_logits:
+            getattr(self.model.gaussians, name).grad = None
+        return super().step(step, steps, enabled)
+
     def _edit(self, name: str, values: Callable[[Tensor], Tensor], moments: Callable[[Tensor], Tensor]) -> None:
         super()._edit(name, values, moments)
         if name in self.missing_logits:
-            nn.init.zeros_(getattr(self.model.gaussians, name)).requires_grad_(False)
+            nn.init.zeros_(getattr(self.model.gaussians, name)).requires_grad_(name == "opacity_logits")
 
 
 @dataclass(frozen=True)

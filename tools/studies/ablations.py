@@ -75,6 +75,8 @@ def train_and_measure(
             raise HyrfTrainingError("a parameter is not finite after the last step", fix="choose another seed")
     except HyrfTrainingError as error:
         return {"failed": str(error)}
+    for name in variant.missing_logits:
+        getattr(trainer.model.gaussians, name).requires_grad_(False)  # its size does not include them
     if variant is FULL_VARIANT:
         save_model(trainer.model, full_path)
     result = measure(variant, trainer.model, load_model(full_path), scene)
