@@ -172,19 +172,19 @@ def test_cameras_that_do_not_fit_the_photos_on_disk_are_refused(plain_file, tmp_
 
 def test_exported_cameras_fit_the_photo_files(plain_file, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
-    export(plain_file, tmp_path / "transforms.json", data=ball_scene(views=4, side=8))
+    export(plain_file, tmp_path / "transforms.json", data=ball_scene(views=4, side=32))
     for frame in json.loads((tmp_path / "transforms.json").read_text())["frames"]:
         (tmp_path / frame["file_path"]).parent.mkdir(exist_ok=True)
-        Image.new("RGB", (8, 8)).save(tmp_path / frame["file_path"])
-    small = hyrfpack.load_scene(tmp_path, max_size=4)
-    assert small.train[0].camera.width == 4
+        Image.new("RGB", (32, 32)).save(tmp_path / frame["file_path"])
+    small = hyrfpack.load_scene(tmp_path, max_size=16)
+    assert small.train[0].camera.width == 16
     (tmp_path / "out").mkdir()
     export(plain_file, tmp_path / "out" / "cameras.json", data=small)
     content = json.loads((tmp_path / "out" / "cameras.json").read_text())
-    assert content["w"] == 8 and all((tmp_path / "out" / frame["file_path"]).exists() for frame in content["frames"])
+    assert content["w"] == 32 and all((tmp_path / "out" / frame["file_path"]).exists() for frame in content["frames"])
     export(plain_file, tmp_path / "colmap", data=small)
     cameras = pycolmap.Reconstruction(tmp_path / "colmap" / "sparse" / "0").cameras
-    assert {camera.width for camera in cameras.values()} == {8}
+    assert {camera.width for camera in cameras.values()} == {32}
 
 
 @pytest.mark.parametrize("target", ["transforms.json", "colmap"])

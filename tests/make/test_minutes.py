@@ -103,16 +103,16 @@ def fitted_plan(
 
 def test_large_photos_are_reduced_when_time_is_short(posed, scene, monkeypatch, caplog):
     def cost(scene, *_):
-        return SceneCost(1e-3 * scene.train[0].camera.width ** 2, 0.0, 0.0, 0.0, 100)
+        return SceneCost(5e-4 * scene.train[0].camera.width ** 2, 0.0, 0.0, 0.0, 100)
 
     monkeypatch.setattr(minutes, "measure_scene_cost", cost)
-    monkeypatch.setattr(minutes, "CANDIDATE_PHOTO_SIZES", (24, 16, 8))
+    monkeypatch.setattr(minutes, "CANDIDATE_PHOTO_SIZES", (28, 24, 16))
 
     def planned(seconds: float) -> Plan:
         return fitted_plan(posed, scene, make_plan(90_000), seconds)
 
     plans = [planned(seconds) for seconds in (3000.0, 300.0, 100.0)]
-    assert [plan.max_size for plan in plans] == [1600, 16, 8] and {plan.target_bytes for plan in plans} == {90_000}
+    assert [plan.max_size for plan in plans] == [1600, 24, 16] and {plan.target_bytes for plan in plans} == {90_000}
     assert plans[0].steps > 1000 and any("pixels" in sentence for sentence in caplog.messages)
 
 

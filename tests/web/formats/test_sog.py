@@ -23,7 +23,7 @@ from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS
-from tools.browser.chromium import Chromium, find
+from tools.browser.chromium import Chromium, find_program
 
 READ_IN_WORKER_JS = """(async (address) => {
   const worker = new Worker("reader.mjs", { type: "module" });
@@ -55,7 +55,7 @@ class BrowserReader:
 
 @pytest.fixture(scope="module")
 def browser_reader(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BrowserReader]:
-    if find() is None:
+    if find_program() is None:
         pytest.skip("there is no Chromium on this machine")
     folder = tmp_path_factory.mktemp("files")
     flags = ("--enable-unsafe-swiftshader", "--use-angle=swiftshader")

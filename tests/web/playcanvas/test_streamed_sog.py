@@ -25,7 +25,7 @@ from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.files import read_splats
 from hyrfpack.splats.splats import concatenate
-from tools.browser.chromium import Chromium, find
+from tools.browser.chromium import Chromium, find_program
 
 pytestmark = pytest.mark.acceptance
 NODE_MODULES = Path(__file__).parents[2] / "bundlers" / "node_modules"
@@ -53,7 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def engine() -> Iterator[Chromium]:
-    if find() is None:
+    if find_program() is None:
         pytest.skip("there is no Chromium on this machine")
     with Chromium("--enable-unsafe-swiftshader", "--use-angle=swiftshader", timeout_seconds=180) as browser:
         browser.resize(SIZE_PIXELS, SIZE_PIXELS)

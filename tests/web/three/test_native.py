@@ -42,7 +42,7 @@ from hyrfpack.ops.viewport import Viewport
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.render.renderer import apply_exposure_map
 from hyrfpack.scene import Camera
-from tools.browser.chromium import Chromium, find
+from tools.browser.chromium import Chromium, find_program
 
 GOLDEN_FILE = Path(__file__).parents[2] / "golden" / "trained" / "demo_compact.hyrf"
 EXACT_SETTINGS = RenderSettings(background_threshold=0, transmittance_min=0, exposure="consistent")
@@ -53,7 +53,7 @@ __all__ = ["app_folder"]
 
 @pytest.fixture(scope="module")
 def three_browser() -> Iterator[Chromium]:
-    if find() is None:
+    if find_program() is None:
         pytest.skip("there is no Chromium on this machine")
     with Chromium("--enable-unsafe-swiftshader", "--use-angle=swiftshader", timeout_seconds=180) as browser:
         yield browser

@@ -28,7 +28,7 @@ from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.model import Frame, HybridModel
 from hyrfpack.render import render_view
 from hyrfpack.scene import Camera
-from tools.browser.chromium import Chromium, find
+from tools.browser.chromium import Chromium, find_program
 
 PROJECT_FOLDER = Path(__file__).parents[3]
 NODE_MODULES = PROJECT_FOLDER / "tests" / "node" / "node_modules"
@@ -162,7 +162,7 @@ def field_settings() -> dict[str, Any]:
 
 
 @pytest.mark.acceptance
-@pytest.mark.skipif(find() is None, reason="there is no Chromium on this machine")
+@pytest.mark.skipif(find_program() is None, reason="there is no Chromium on this machine")
 def test_the_example_page_shows_the_rendered_picture(app_folder: Path, tmp_path: Path) -> None:
     save_model(make_model(), app_folder / "scene.hyrf")
     flags = ("--enable-unsafe-swiftshader", "--use-angle=swiftshader")
