@@ -14,7 +14,7 @@ from web.site import Site, drop_file
 from hyrfpack.web.player import encode_player
 
 pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
-PHONE_OPTIONS = {"dense": 2.0, "phone": True}
+PHONE_OPTIONS = {"pixel_ratio": 2.0, "phone": True}
 SCENE_FOLDER = Path(__file__).parents[1] / "golden" / "scene"
 HTML_DATA = b"\xef\xbb\xbf\n<!doctype html><title>Sorry</title>" * 20
 

@@ -39,7 +39,7 @@ from hyrfpack.web.html import decode_splats_page
 from hyrfpack.web.serve import serve_in_thread
 
 pytestmark = pytest.mark.in_turn
-PHONE_OPTIONS = {"dense": 2.0, "phone": True}
+PHONE_OPTIONS = {"pixel_ratio": 2.0, "phone": True}
 
 
 @pytest.fixture(autouse=True)

@@ -9,7 +9,7 @@ from web.pages import Browser, make_splats_page, random_splats, wait_until
 from web.site import GOLDEN_FILE_DATA, Site, drop_file
 
 pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
-PHONE_OPTIONS = {"dense": 2.0, "phone": True}
+PHONE_OPTIONS = {"pixel_ratio": 2.0, "phone": True}
 
 
 RECORD_SHARING_JS = """(() => {
