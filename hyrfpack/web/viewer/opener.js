@@ -38,13 +38,13 @@ export class Opener {
 
   // Opens the scene that the page or its address names, if there is one. `hasFile` is true if the page has a file, and
   // `served` is the {content, title, stages, updates} of a hosted page, or null. `parameters` are those of parseSearch.
-  async openFirst(hasFile, served, parameters) {
+  // `address` and `stage` are those of findFirstFile.
+  async openFirst(hasFile, served, parameters, { address, stage }) {
     if (hasFile) {
       await this.player.load(readPayload(), element("background"));
       postToParent("load");
       return;
     }
-    const { address, stage } = findFirstFile(served, parameters);
     const isTraining = this.watchTraining && !parameters.content && served?.updates;
     const updates = isTraining ? resolveAddress(served.updates, "content") : null;
     if (updates) return this.watchTraining(this, address, updates, served.title);
@@ -62,9 +62,9 @@ export class Opener {
     document.body.classList.toggle("empty", this.invites && !this.player.loaded);
   }
 
-  // Opens a file that the user chose, if there is one.
+  // Opens a file that the user chose.
   openFile(file) {
-    if (file) this.open(async () => chosenFile(file), null, false).catch(fail);
+    this.open(async () => chosenFile(file), null, false).catch(fail);
   }
 
   // Opens a scene. `fetchFile` returns a promise of {name, stream}. `name` is the scene's title; if it is null, the

@@ -22,8 +22,8 @@ const IGNORED_TEXTS = {
 
 // Shows the picture that the address names, or else the page's, and returns it. The page's is one of its own file from
 // the first camera; if the address names another file or camera, it is removed. Returns null without a picture.
-function showPoster(parameters, embedded, served) {
-  const { isOwn, stage } = findFirstFile(served, parameters), named = namedCamera(parameters);
+function showPoster(parameters, embedded, { isOwn, stage }) {
+  const named = namedCamera(parameters);
   const isFirstView = named === null || named === "1", picture = element("poster");
   const address = embedded ? null : parameters.poster; // the policy of a page of one file forbids other pictures
   if (!address && !(isFirstView && (embedded || isOwn))) picture?.remove();
@@ -89,7 +89,8 @@ function start({ startEditing = () => {}, streaming = null, watchTraining }) {
   const embedded = element("scene") ? JSON.parse(elementText("scene")) : null;
   const served = element("content") ? JSON.parse(elementText("content")) : null;
 
-  const poster = showPoster(parameters, embedded, served);
+  const firstFile = findFirstFile(served, parameters), { isOwn } = firstFile;
+  const poster = showPoster(parameters, embedded, firstFile);
   const maxGaussians = parameters.gaussians;
   const player = new Player(element("view"), { scene: embedded, workerAddress, streaming, maxGaussians });
   const help = new Help();
@@ -120,7 +121,7 @@ function start({ startEditing = () => {}, streaming = null, watchTraining }) {
 
   const setTurning = (isOn) => {
     navigation.turntable.turn(isOn);
-    element("turn").setAttribute("aria-pressed", String(isOn));
+    element("turn").setAttribute("aria-pressed", isOn);
   };
 
   const switchExposure = () => {
@@ -161,7 +162,7 @@ function start({ startEditing = () => {}, streaming = null, watchTraining }) {
   });
   const title = embedded ? (parameters.title ?? embedded.title) : document.title;
   const opener = new Opener(player, panel, { title, watchTraining });
-  const { isOwn, stage } = findFirstFile(served, parameters), isCredited = embedded || isOwn || stage;
+  const isCredited = embedded || isOwn || firstFile.stage;
   const { file } = embedded ?? (isOwn && served) ?? {};
   const editor = startEditing({ player, navigation, panel, opener, file });
   if (parameters.exposure) player.exposure = parameters.exposure;
@@ -196,7 +197,8 @@ function start({ startEditing = () => {}, streaming = null, watchTraining }) {
   // ---- opening scenes
 
   const openFile = (file) => {
-    if (file) poster?.remove();
+    if (!file) return;
+    poster?.remove();
     opener.openFile(file);
   };
   element("file").onchange = ({ target }) => {
@@ -222,7 +224,7 @@ function start({ startEditing = () => {}, streaming = null, watchTraining }) {
     followNamedCamera();
   }
   element("credit").hidden = !isCredited;
-  const ready = opener.openFirst(Boolean(embedded), served, parameters);
+  const ready = opener.openFirst(Boolean(embedded), served, parameters, firstFile);
   ready.catch(report);
   if (parameters.wrong.length) report({ message: parameters.wrong.join(" ") });
 

@@ -62,7 +62,7 @@ export class Panel {
   showExposure() {
     const { hasExposureMap, exposure } = this.player;
     for (const part of document.querySelectorAll("[data-needs-map]")) part.hidden = !hasExposureMap;
-    element("exposure").setAttribute("aria-pressed", String(exposure === AS_PHOTOGRAPHED));
+    element("exposure").setAttribute("aria-pressed", exposure === AS_PHOTOGRAPHED);
   }
 
   // Performs the action of a key, and shows its error if it fails.
@@ -78,7 +78,7 @@ export class Panel {
 
   toggleSettings(isOpen = element("settings").hidden) {
     element("settings").hidden = !isOpen;
-    element("menu").setAttribute("aria-expanded", String(isOpen));
+    element("menu").setAttribute("aria-expanded", isOpen);
     this.wake();
   }
 

@@ -49,9 +49,7 @@ export class Player extends EventTarget {
     scene = null, workerAddress = null, streaming = null, maxGaussians = null, rendererClass = Renderer,
   } = {}) {
     super();
-    Object.assign(this, { streaming, maxGaussians, rendererClass });
-    this.canvas = canvas;
-    this.workerAddress = workerAddress;
+    Object.assign(this, { canvas, workerAddress, streaming, maxGaussians, rendererClass });
     this.renderer = this.createRenderer();
     this.renderer.prepare().catch(() => {}); // while the file loads; `install` reports errors
     this.loader = null; // the loader of the file that is drawn

@@ -31,14 +31,14 @@ export class Strip {
   mark() {
     [...this.strip.children].forEach((button, number) => {
       const isCurrent = number === this.player.camera;
-      button.setAttribute("aria-pressed", String(isCurrent));
+      button.setAttribute("aria-pressed", isCurrent);
       if (isCurrent) this.strip.scrollLeft = button.offsetLeft - (this.strip.clientWidth - button.offsetWidth) / 2;
     });
   }
 
   toggle(isOpen = this.strip.hidden) {
     this.strip.hidden = !isOpen;
-    element("views").setAttribute("aria-expanded", String(isOpen));
+    element("views").setAttribute("aria-expanded", isOpen);
     this.mark();
     this.drawing ??= this.draw().catch(fail).finally(() => (this.drawing = null));
   }

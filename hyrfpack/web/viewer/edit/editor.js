@@ -79,7 +79,7 @@ export class Editor {
     if (isOpen && element("edit-button").hidden) return;
     element("edit").hidden = !isOpen;
     document.body.classList.toggle("editing", isOpen);
-    element("edit-button").setAttribute("aria-expanded", String(isOpen));
+    element("edit-button").setAttribute("aria-expanded", isOpen);
     if (isOpen) this.panel.toggleSettings(false);
     this.choose(this.toolName);
   }
@@ -91,7 +91,7 @@ export class Editor {
     const isOpen = !element("edit").hidden, isMerged = Boolean(this.player.scene?.parts);
     const isRefused = isMerged && !TOOLS_FOR_ANY_FILE.includes(name);
     for (const button of document.querySelectorAll("[data-tool]")) {
-      button.setAttribute("aria-pressed", String(button.dataset.tool === name));
+      button.setAttribute("aria-pressed", button.dataset.tool === name);
     }
     for (const pane of document.querySelectorAll("[data-pane]")) pane.hidden = pane.dataset.pane !== name || isRefused;
     element("edit-refusal").hidden = !isRefused;

@@ -21,7 +21,7 @@ export class UpTool {
 
   get drawn() {
     const { points } = this.picker;
-    return { points, labels: points.map((at, k) => ({ at, text: String(k + 1) })) };
+    return { points, labels: points.map((at, k) => ({ at, text: k + 1 })) };
   }
 
   pick(x, y) {
