@@ -77,7 +77,8 @@ globalThis.document = {
 };
 globalThis.location = new URL("http://host/");
 globalThis.navigator ??= { hardwareConcurrency: 2 };
-globalThis.matchMedia = () => ({ matches: false });
+globalThis.devicePixelRatio = 1;
+globalThis.matchMedia = () => Object.assign(new EventTarget(), { matches: false });
 globalThis.addEventListener = (name, listener) => name === "message" && listeners.push(listener);
 globalThis.removeEventListener = () => {};
 globalThis.IntersectionObserver = globalThis.ResizeObserver = Observer;

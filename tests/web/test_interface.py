@@ -133,6 +133,14 @@ def test_a_focused_button_shows_its_name_and_key(browser: Browser, tmp_path: Pat
     assert browser.evaluate(tip) == "visible"
 
 
+def test_a_picture_at_rest_follows_the_pixel_ratio_of_the_window(browser: Browser, tmp_path: Path):
+    open_page(browser, tmp_path, make_splats_page(random_splats(50)))
+    wait_until(browser, "hyrfpack.player.idle")
+    for ratio in (2.0, 1.5, 1.0):
+        browser.resize(240, 180, pixel_ratio=ratio)
+        wait_until(browser, f"hyrfpack.player.canvas.width === {240 * ratio:.0f}")
+
+
 # ---- the strip of cameras
 
 

@@ -66,5 +66,11 @@ def test_viewers_start_workers_by_one_policy_for_trusted_types(loads: dict):
     assert loads["policies"] == [["hyrf-viewer"], ["blob", "http"]]
 
 
+def test_each_change_of_the_pixel_ratio_requests_a_frame_until_the_viewer_is_destroyed(loads: dict):
+    found = loads["pixelRatios"]
+    assert found["requested"] == [1, 1] and found["afterEnd"] == 0
+    assert found["queries"] == [f"(resolution: {ratio}dppx)" for ratio in (1, 2, 1.5)]
+
+
 def test_setting_the_camera_that_was_read_moves_nothing(loads: dict):
     assert loads["cameras"]["drift"] < MAX_POSE_ERROR and loads["cameras"]["error"] < MAX_POSE_ERROR

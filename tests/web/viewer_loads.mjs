@@ -12,6 +12,8 @@
 //     `wrong`: the errors of arguments that are not valid
 //     `refusal`: the error of a page that requires Trusted Types and does not allow the policy of the viewer
 //     `policies`: the policies that two viewers create on a page that allows them, and the addresses of their workers
+//     `pixelRatios`: the media queries of a viewer at first and after each of two changes of the pixel ratio, the
+//         frames that each change requests, and those that a change requests after the viewer was destroyed
 //     `cameras`: how far 1,000 rounds of reading and setting the camera move it (`drift`), and how far a camera that was
 //         set is from the one that is read back (`error`)
 
@@ -43,7 +45,8 @@ globalThis.document = {
 };
 globalThis.location = new URL("http://host/");
 globalThis.navigator ??= { hardwareConcurrency: 2 };
-globalThis.matchMedia = () => ({ matches: false });
+globalThis.devicePixelRatio = 1;
+globalThis.matchMedia = (query) => Object.assign(new EventTarget(), { query, matches: false });
 globalThis.addEventListener = globalThis.removeEventListener = () => {};
 globalThis.IntersectionObserver = globalThis.ResizeObserver = Observer;
 globalThis.reportError = ({ message }) => reported.push(message);
@@ -192,6 +195,27 @@ globalThis.Worker = class {
 for (const workerUrl of [null, "worker.js"]) openWith({ workerUrl }).load(new Blob(["scene"])).catch(() => {});
 await wait();
 result.policies = [policies, workers];
+
+const queries = [], matchBefore = globalThis.matchMedia;
+let frames = 0;
+globalThis.requestAnimationFrame = () => frames++;
+globalThis.matchMedia = (query) => {
+  queries.push(matchBefore(query));
+  return queries.at(-1);
+};
+const scaled = makeViewer();
+scaled.player.loaded = true;
+const changeRatio = (ratio) => {
+  const before = frames;
+  globalThis.devicePixelRatio = ratio;
+  for (const query of [...queries]) query.dispatchEvent(new Event("change"));
+  scaled.player.scheduled = false;
+  return frames - before;
+};
+const requested = [changeRatio(2), changeRatio(1.5)];
+scaled.destroy();
+scaled.player.loaded = true;
+result.pixelRatios = { queries: queries.map(({ query }) => query), requested, afterEnd: changeRatio(1) };
 
 // The rows of this pose are rounded to 3 digits.
 const scene = { center: [1000, -50, 20], unit: 4, up: [0, -1, 0], target: [1000, -50, 20] };

@@ -96,6 +96,17 @@ export class Player extends EventTarget {
     for (const event of ["resize", "visibilitychange"]) addEventListener(event, () => this.wake(), { signal });
     this.observer = new ResizeObserver(() => this.schedule());
     this.observer.observe(canvas);
+    this.watchPixelRatio();
+  }
+
+  // Draws again when the window gets another pixel ratio, as on another screen: its size may be the same in CSS pixels.
+  watchPixelRatio() {
+    const query = matchMedia(`(resolution: ${devicePixelRatio}dppx)`), { signal } = this.aborter;
+    const follow = () => {
+      this.watchPixelRatio();
+      this.wake();
+    };
+    query.addEventListener("change", follow, { signal, once: true });
   }
 
   // Creates a renderer of the player's class for its canvas.
