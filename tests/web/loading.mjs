@@ -5,7 +5,8 @@
 // address; `cancelled`: whether a file that is not read is no longer downloaded, and whether the whole file is not,
 // which a server sends in place of the rest of a broken download; `lifted`: what the controls of an embedded scene
 // report when a pointer is released that was pressed elsewhere; `changes`: how many changes controls report when a key
-// that flies is pressed on their canvas, which lies in a dialog, and in a field of that dialog; and `partEvents`: the
+// that flies is pressed on their canvas, which lies in a dialog, and in a field of that dialog; `zooms`: the signs of
+// zooms by wheels, also by one with Shift, which browsers turn to the side, and by one to the side; and `partEvents`: the
 // player's events when a part of a scene folder arrives that has the first exposure map of the scene, each with whether
 // the scene has a map by then.
 
@@ -84,6 +85,15 @@ const press = (target) => {
 };
 const changesOf = [press(canvas), press(new EventTarget())];
 
+const zooms = [], turned = Object.assign(new EventTarget(), { style: {}, clientWidth: 100, clientHeight: 100 });
+turned.getBoundingClientRect = () => ({ left: 0, top: 0 });
+const zoomer = { zoom: (step) => zooms.push(Math.sign(step)) };
+new Controls({ canvas: turned, eye: { focal: 1 } }, zoomer, { keyTarget: turned, isEmbedded: false, acted: () => {} });
+for (const [deltaX, deltaY, shiftKey] of [[0, 9, false], [0, -9, true], [9, 0, true], [9, 0, false]]) {
+  const wheel = { deltaX, deltaY, shiftKey, deltaMode: 0, clientX: 50, clientY: 50 };
+  turned.dispatchEvent(Object.assign(new Event("wheel", { cancelable: true }), wheel));
+}
+
 const partEvents = [], place = { scale: 1 }, parts = [{ exposure: null, place }, { exposure: null, place }];
 player.scene = { near: 1, sortNear: 1, exposure: null, parts };
 player.emit = (name) => partEvents.push([name, hasExposureMap(player.scene)]);
@@ -92,5 +102,5 @@ streamed.addPart({ number: 1, part: 1, exposure: {}, place });
 
 const loaderError = error.constructor.name;
 const result = { loaderError, folderName, cancelled: cancelled.slice(0, 2), lifted, changes: changesOf, partEvents };
-console.log(JSON.stringify(result));
+console.log(JSON.stringify({ ...result, zooms }));
 process.exit();

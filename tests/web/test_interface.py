@@ -546,6 +546,20 @@ def test_escape_closes_the_help_alone(browser: Browser, tmp_path: Path):
     assert is_hidden(browser, "settings")
 
 
+def test_escape_closes_the_settings_in_the_moment_after_it_has_closed_the_help(browser: Browser, tmp_path: Path):
+    browser.resize(1280, 800)
+    open_page(browser, tmp_path, make_splats_page(random_splats(3)))
+    browser.press("m")
+    browser.press("?")
+    # A closed dialog keeps the focus until the browser draws the next frame.
+    browser.evaluate(
+        "(({ activeElement: button }) => { document.getElementById('help').close();"
+        " const key = { key: 'Escape', code: 'Escape', bubbles: true };"
+        " button.dispatchEvent(new KeyboardEvent('keydown', key)); })(document)"
+    )
+    assert is_hidden(browser, "help") and is_hidden(browser, "settings")
+
+
 def test_text_that_is_dropped_is_left_to_the_browser(browser: Browser, tmp_path: Path):
     open_page(browser, tmp_path, make_splats_page(random_splats(3)))
     assert browser.evaluate(

@@ -58,3 +58,7 @@ def test_cancelled_requests_do_not_count_as_breaks_of_the_connection(closed_stre
 
 def test_a_part_with_the_first_exposure_map_of_its_scene_is_an_event(loading: dict):
     assert loading["partEvents"] == [["exposure", True]]
+
+
+def test_a_wheel_with_shift_zooms_although_browsers_turn_it_to_the_side(loading: dict):
+    assert loading["zooms"] == [1, -1, 1, 0]

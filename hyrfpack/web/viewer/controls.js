@@ -9,6 +9,7 @@ const ORBIT_RADIANS = 3.6; // the rotation for a drag of two focal lengths
 const FLY_AXES = { W: [0, 0, 1], S: [0, 0, -1], A: [-1, 0, 0], D: [1, 0, 0], Q: [0, 1, 0], E: [0, -1, 0] };
 const LOOK_SIGNS = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }; // yaw, pitch
 const ZOOM_SIGNS = { "+": -1, "-": 1 }; // zooming in lowers the depth
+const WHEEL_UNITS_PIXELS = [1, 33, 400]; // browsers measure the wheel in pixels, lines or pages
 const FLY_SPEED = 0.5; // `pace` of the eye per second
 const SHIFT_FACTOR = 4;
 const LOOK_RADIANS_PER_SECOND = 1.0;
@@ -158,9 +159,9 @@ export class Controls {
 
   wheel(event) {
     if (!this.engaged) return this.ignored("wheel");
-    const lines = event.deltaMode === 1 ? 33 : event.deltaMode === 2 ? 400 : 1;
     const speed = event.ctrlKey ? 0.01 : 0.0012; // browsers report a pinch on a trackpad as Ctrl and small wheel steps
-    const step = Math.max(-0.5, Math.min(0.5, event.deltaY * lines * speed));
+    const delta = event.deltaY || (event.shiftKey ? event.deltaX : 0); // with Shift, browsers scroll to the side
+    const step = Math.max(-0.5, Math.min(0.5, delta * WHEEL_UNITS_PIXELS[event.deltaMode] * speed));
     event.preventDefault();
     this.acted();
     if (this.eye) this.damper.zoom(step, ...this.fromMiddle(...this.placeOf(event)));
@@ -174,7 +175,8 @@ export class Controls {
   key(event) {
     const key = keyName(event), moves = FLY_AXES[key] || LOOK_SIGNS[key] || ZOOM_SIGNS[key];
     const inputs = LOOK_SIGNS[key] ? "input" : "input:not([type='range'], [type='checkbox'])";
-    const users = key === "Escape" ? "dialog" : `dialog, select, textarea, ${inputs}`; // elements that use the key
+    // The elements that use the key. A dialog that was closed keeps the focus until the browser draws the next frame.
+    const users = "dialog[open]" + (key === "Escape" ? "" : `, select, textarea, ${inputs}`);
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     if (event.target !== this.canvas && event.target.closest?.(users)) return; // the canvas may lie in a dialog
     if (moves || key === "Shift") {
