@@ -6,12 +6,14 @@
 // which a server sends in place of the rest of a broken download; `lifted`: what the controls of an embedded scene
 // report when a pointer is released that was pressed elsewhere; `changes`: how many changes controls report when a key
 // that flies is pressed on their canvas, which lies in a dialog, and in a field of that dialog; `zooms`: the signs of
-// zooms by wheels, also by one with Shift, which browsers turn to the side, and by one to the side; and `partEvents`: the
+// zooms by wheels, also by one with Shift, which browsers turn to the side, and by one to the side; `openErrors`: the
+// errors of a scene and of another one that replaces it, where both fail, the other one first; and `partEvents`: the
 // player's events when a part of a scene folder arrives that has the first exposure map of the scene, each with whether
 // the scene has a map by then.
 
 globalThis.window = globalThis.self = globalThis;
-globalThis.document = { baseURI: "http://host/" };
+const page = { body: { classList: { remove() {}, toggle() {} } }, getElementById: () => ({}) };
+globalThis.document = { baseURI: "http://host/", ...page };
 globalThis.location = new URL("http://host/");
 globalThis.navigator ??= { hardwareConcurrency: 2 };
 globalThis.matchMedia = () => ({ matches: false });
@@ -27,6 +29,7 @@ globalThis.Worker = class {
 const { STREAMING } = await import("../../hyrfpack/web/viewer/stream/stream_loader.js");
 const { fetchedFile } = await import("../../hyrfpack/web/viewer/source.js");
 const { Controls } = await import("../../hyrfpack/web/viewer/controls.js");
+const { Opener } = await import("../../hyrfpack/web/viewer/opener.js");
 const { hasExposureMap } = await import("../../hyrfpack/web/viewer/exposure.js");
 
 const player = Object.assign(new EventTarget(), { renderer: { largest: [4096, 4096] }, maxGaussians: 1 });
@@ -94,6 +97,20 @@ for (const [deltaX, deltaY, shiftKey] of [[0, 9, false], [0, -9, true], [9, 0, t
   turned.dispatchEvent(Object.assign(new Event("wheel", { cancelable: true }), wheel));
 }
 
+const openErrors = [], rejections = [];
+const failing = { open: () => new Promise((_, reject) => rejections.push(reject)) };
+const opener = new Opener(failing, null, { title: "a scene" });
+const openFailing = (name) => opener.open(async () => ({ name })).catch(({ message }) => openErrors.push(message));
+const names = ["first", "second"], opened = [];
+for (const name of names) {
+  opened.push(openFailing(name));
+  await new Promise((done) => setTimeout(done));
+}
+for (const number of [1, 0]) {
+  rejections[number](new Error(names[number]));
+  await opened[number];
+}
+
 const partEvents = [], place = { scale: 1 }, parts = [{ exposure: null, place }, { exposure: null, place }];
 player.scene = { near: 1, sortNear: 1, exposure: null, parts };
 player.emit = (name) => partEvents.push([name, hasExposureMap(player.scene)]);
@@ -102,5 +119,5 @@ streamed.addPart({ number: 1, part: 1, exposure: {}, place });
 
 const loaderError = error.constructor.name;
 const result = { loaderError, folderName, cancelled: cancelled.slice(0, 2), lifted, changes: changesOf, partEvents };
-console.log(JSON.stringify({ ...result, zooms }));
+console.log(JSON.stringify({ ...result, zooms, openErrors }));
 process.exit();

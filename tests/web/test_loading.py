@@ -62,3 +62,7 @@ def test_a_part_with_the_first_exposure_map_of_its_scene_is_an_event(loading: di
 
 def test_a_wheel_with_shift_zooms_although_browsers_turn_it_to_the_side(loading: dict):
     assert loading["zooms"] == [1, -1, 1, 0]
+
+
+def test_a_scene_reports_its_error_although_one_that_should_replace_it_has_failed(loading: dict):
+    assert loading["openErrors"] == ["second", "first"]

@@ -55,14 +55,14 @@ const trainingTitle = (title, { step, steps, kind }) =>
 export function watchTraining(opener, address, updates, sceneTitle) {
   const { player, panel } = opener;
   return new Promise((shown, failed) => {
-    let thisOpen = opener.openCount, isShown = false; // changes when the user opens a file
-    const isWanted = () => thisOpen === opener.openCount;
+    let own = opener.wanted, isShown = false;
+    const isWanted = () => own === opener.wanted; // until the user opens a file
     const show = async (training) => {
       const title = trainingTitle(sceneTitle, training);
       if (!isShown) {
         remark("");
         const opening = opener.open(() => fetchedFile(address), title);
-        thisOpen = opener.openCount;
+        own = opener.wanted;
         await opening;
         isShown = true;
         return shown();
