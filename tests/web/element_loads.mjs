@@ -7,7 +7,14 @@
 //     `property`: the requests of an element whose property `src` was set before the class was defined, and to another
 //         address later; its attribute; and the attribute after the property was set to null
 //     `message`: whether the error is shown after the failure and after the next attempt has begun
-//     `lost`: the message while the graphics context is lost, after a wheel that is left to the page
+//     `lost`: the message while the graphics context is lost, after a wheel that is left to the page, and whether it is
+//         shown after progress of the load
+//     `overlapping`: whether the error of a load is shown at first, after progress of the scene that is shown and after
+//         progress of a later load, and whether an error of the attribute `exposure` is shown after progress of the
+//         load during which it was set
+//     `suspended`: what an element opens when it resumes, {addresses: requests, camera, size: of a Blob, name}, by what
+//         its viewer has shown before: the scene of `src`, that of another address, one of bytes, and one of a stream;
+//         and, after another address, for an element whose `camera` or `src` was changed meanwhile
 //     `frame`: how many frames were made at first, and by the same `src` after an error and after a load
 
 const addresses = [], frames = [], listeners = [];
@@ -140,7 +147,8 @@ result.shown = [afterSuccess, await addedBy(addresses, setAgain)];
 Object.assign(element.view, { isNear: true, isFailed: false });
 viewer.canvas.dispatchEvent(new Event("webglcontextlost"));
 viewer.emit("ignored", { kind: "wheel" });
-result.lost = message.textContent;
+viewer.player.emit("progress", { part: 0.5 });
+result.lost = [message.textContent, !message.hidden];
 
 const early = new Viewer(), setSrc = (src) => addedBy(addresses, () => (early.src = src));
 Object.defineProperty(early, "src", { value: "early.hyrf", configurable: true, writable: true, enumerable: true });
@@ -149,6 +157,49 @@ const laterRequests = await setSrc("later.hyrf");
 const attribute = early.getAttribute("src");
 await setSrc(null);
 result.property = [earlyRequests, laterRequests, attribute, early.src];
+
+const overlapped = await connect({ src: "first.hyrf" }), isShown = () => !overlapped.view.message.hidden;
+const { viewer: busy } = overlapped, makeProgress = () => busy.player.emit("progress", { part: 0.5 });
+const showLast = (viewer) => (viewer.player.loader = { origin: viewer.currentLoad, dispose() {} });
+showLast(busy);
+busy.load("missing.hyrf").catch(() => {});
+await wait();
+answer();
+await wait();
+result.overlapping = [isShown()];
+makeProgress();
+result.overlapping.push(isShown());
+busy.load("later.hyrf").catch(() => {});
+makeProgress();
+result.overlapping.push(isShown());
+overlapped.setAttribute("exposure", "none");
+await wait();
+makeProgress();
+result.overlapping.push(isShown());
+
+// Shows a source in an element, suspends it, makes changes and resumes it. Returns what it opens.
+async function resumeAfter(source, change = () => {}) {
+  const element = await connect({ src: "own.hyrf", camera: "2" }), { view, viewer } = element;
+  if (source) viewer.load(source, { name: "a name" }).catch(() => {});
+  showLast(viewer);
+  Object.defineProperty(viewer, "cameraText", { value: "its camera" });
+  const requests = await addedBy(addresses, async () => {
+    view.suspend();
+    change(element);
+    await wait();
+    view.open();
+  });
+  const { currentLoad: { firstCamera, source: opened, name = null } } = view.viewer;
+  return { addresses: requests, camera: firstCamera, size: opened?.size ?? null, name };
+}
+result.suspended = {
+  own: await resumeAfter(null),
+  other: await resumeAfter("other.hyrf"),
+  bytes: await resumeAfter(new DataView(new ArrayBuffer(10), 3)),
+  stream: await resumeAfter(new ReadableStream()),
+  camera: await resumeAfter("other.hyrf", (element) => element.setAttribute("camera", "3")),
+  src: await resumeAfter("other.hyrf", (element) => element.setAttribute("src", "new.hyrf")),
+};
 
 const framed = await connect({ src: "a.hyrf", player: "index.html", frame: "" });
 const send = (hyrf) => listeners.at(-1)({ source: frames.at(-1), data: { hyrf, message: "" } });

@@ -83,6 +83,21 @@ def test_an_element_that_comes_back_keeps_its_camera(one_browser: Browser, host:
     assert [float(part) for part in found.split(",")] == pytest.approx([float(part) for part in text.split(",")])
 
 
+def test_an_element_that_comes_back_shows_the_scene_that_a_script_has_loaded(one_browser: Browser, host: Site):
+    open_elements(one_browser, host)
+    wait_until(one_browser, "isDrawn(0)")
+    one_browser.evaluate("elementAt(0).viewer.load('some scene.hyrf', { name: 'another' })")
+    one_browser.evaluate("elementAt(0).viewer.camera = '0.5,0.2,-3,1,0,0,0,1.2,3'")
+    text = one_browser.evaluate("elementAt(0).viewer.cameraText")
+    for number in range(1, MAX_SCENES + 2):
+        show_element(one_browser, number)
+    assert one_browser.evaluate("elementAt(0).viewer") is None
+    show_element(one_browser, 0)
+    title, found = one_browser.evaluate("(({ viewer }) => [viewer.scene.title, viewer.cameraText])(elementAt(0))")
+    assert title == "another"
+    assert [float(part) for part in found.split(",")] == pytest.approx([float(part) for part in text.split(",")])
+
+
 def test_an_element_that_is_suspended_while_another_scene_loads_opens_it_at_its_own_camera(
     one_browser: Browser, host: Site
 ):

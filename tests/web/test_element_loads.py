@@ -31,8 +31,37 @@ def test_the_error_is_hidden_when_the_next_attempt_begins(loads: dict):
     assert loads["message"] == [True, False]
 
 
-def test_a_hint_does_not_replace_the_message_that_the_graphics_context_is_lost(loads: dict):
-    assert loads["lost"].startswith("The graphics device was lost")
+def test_a_hint_and_progress_do_not_replace_the_message_that_the_graphics_context_is_lost(loads: dict):
+    text, is_shown = loads["lost"]
+    assert text.startswith("The graphics device was lost") and is_shown
+
+
+def test_an_error_stays_until_a_later_load_makes_progress(loads: dict):
+    after_failure, with_progress_of_the_shown_scene, with_progress_of_a_later_load, of_an_attribute = loads[
+        "overlapping"
+    ]
+    assert after_failure and with_progress_of_the_shown_scene and not with_progress_of_a_later_load
+    assert of_an_attribute, "the progress of the scene hides an error of another attribute"
+
+
+@pytest.mark.parametrize(
+    ("shown", "addresses", "camera"),
+    [
+        ("own", ["own.hyrf"], "its camera"),
+        ("other", ["other.hyrf"], "its camera"),
+        ("bytes", [], "its camera"),
+        ("stream", ["own.hyrf"], "2"),
+        ("camera", ["other.hyrf"], "3"),
+        ("src", ["new.hyrf"], "2"),
+    ],
+)
+def test_a_suspended_element_resumes_the_scene_that_it_showed(
+    loads: dict, shown: str, addresses: list[str], camera: str
+):
+    found = loads["suspended"][shown]
+    assert (found["addresses"], found["camera"]) == (addresses, camera)
+    assert found["size"] == (7 if shown == "bytes" else None)
+    assert found["name"] == ("a name" if shown in ("other", "bytes", "camera") else None)
 
 
 def test_a_frame_is_made_again_by_the_same_src_only_after_an_error(loads: dict):

@@ -22,9 +22,11 @@ export class InlineView {
     this.shown = {}; // the values of the attributes at the last update
     this.isPending = false; // whether there is a scene to show, but no viewer
     this.isEager = false; // whether a pending scene is also shown far from the window
-    this.cameraText = null; // the camera of the scene before it was suspended
+    // The scene before it was suspended, and its camera: {src, name, camera}; null if the attributes name the scene.
+    this.suspended = null;
     this.isFailed = false; // whether the message is an error
     this.isLoadFailed = false; // whether the last load has failed, so that the scene of `src` is not shown
+    this.failedLoad = null; // the viewer's load whose progress leaves the error shown
     this.wrongAttribute = null; // the name of the attribute whose value is wrong, null for an error of the load
     this.isLost = false; // whether the browser has taken the graphics context away
     const make = (name, attributes = {}) => {
@@ -62,12 +64,20 @@ export class InlineView {
 
   // Frees the viewer until the element is near the window again, and the page has room for it.
   suspend() {
-    // While another scene loads, and after it has failed, the scene that is shown is not that of `src`.
-    if (this.viewer?.isCurrentShown && !this.isLoadFailed) this.cameraText = this.viewer.cameraText;
+    this.keepScene();
     this.close();
     this.isPending = true;
     this.isEager = false;
     if (this.isVisible) this.showMessage(WAITING_TEXT);
+  }
+
+  // Lets the next viewer show the scene and the camera of this one, also if a script has loaded the scene, but not from
+  // a stream, which cannot be read again. After a failed load, the next viewer tries the scene of `src`.
+  keepScene() {
+    const { currentLoad, isCurrentShown, cameraText } = this.viewer ?? {};
+    if (!currentLoad || this.isLoadFailed) return;
+    const { source, name, firstCamera } = currentLoad;
+    this.suspended = source && { src: source, name, camera: isCurrentShown ? cameraText : firstCamera };
   }
 
   // Makes the next update load the scene again if its load has failed, or if files of it are missing.
@@ -80,7 +90,7 @@ export class InlineView {
     if (!this.isPending) return;
     this.close();
     try {
-      this.create({ ...this.shown, camera: this.cameraText ?? this.shown.camera });
+      this.create({ ...this.shown, ...this.suspended });
     } catch (error) {
       this.fail(error);
     }
@@ -92,8 +102,12 @@ export class InlineView {
     const now = Object.fromEntries(INLINE_ATTRIBUTES.map((name) => [name, element.getAttribute(name)]));
     now.src ||= null; // an empty address would be that of the page
     this.shown = now;
-    if (now.src !== before.src || now.camera !== before.camera) this.cameraText = null;
-    if (now.src === null || FIXED_ATTRIBUTES.some((name) => now[name] !== before[name])) this.close();
+    if (now.src === null || FIXED_ATTRIBUTES.some((name) => now[name] !== before[name])) {
+      this.keepScene();
+      this.close();
+    }
+    if (now.src !== before.src) this.suspended = null;
+    else if (this.suspended && now.camera !== before.camera) this.suspended.camera = now.camera;
     if (now.poster !== before.poster) this.showPoster(now.poster);
     if (!this.viewer) {
       this.isPending = now.src !== null;
@@ -138,10 +152,11 @@ export class InlineView {
     else if (camera !== null) viewer.moveTo(camera);
   }
 
-  create({ src, camera, title, exposure, autorotate, interaction, loading, worker }) {
+  create({ src, name, camera, title, exposure, autorotate, interaction, loading, worker }) {
     this.viewer = createViewer({
       container: this.container,
       src,
+      name,
       camera,
       title: title ?? undefined,
       exposure: exposure ?? undefined,
@@ -153,7 +168,7 @@ export class InlineView {
     this.viewer.on("progress", ({ progress }) => {
       this.bar.hidden = progress >= 1;
       this.bar.value = progress;
-      if (progress < 1) {
+      if (progress < 1 && this.isFailed && this.viewer.currentLoad !== this.failedLoad) {
         this.message.hidden = true;
         this.isFailed = this.isLoadFailed = false;
       }
@@ -197,7 +212,10 @@ export class InlineView {
 
   // Shows an error until the next scene is loaded, or until the attribute whose value is wrong is corrected.
   fail({ message }, wrongAttribute = null) {
+    const { viewer } = this, isOfScene = ["src", null].includes(wrongAttribute);
     Object.assign(this, { isFailed: true, wrongAttribute });
+    // The progress of the scene that is shown hides neither its own errors nor that of a load that should replace it.
+    this.failedLoad = (isOfScene ? viewer?.player.loader?.origin : viewer?.currentLoad) ?? null;
     this.isLoadFailed ||= !wrongAttribute;
     this.bar.hidden = true;
     this.showMessage(message);

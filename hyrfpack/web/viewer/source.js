@@ -9,7 +9,14 @@ const OPAQUE_FRAME_TEXT = "the sandbox of this page's frame forbids it; add allo
 
 const UNNAMED_FILE = "the scene";
 
-// Opens an address (string or URL), a Blob or a File, bytes (ArrayBuffer or Uint8Array), or a ReadableStream of bytes.
+// Returns a source for `openSource` that can be opened again later, with a copy of bytes, or null for a stream.
+export function keepSource(source) {
+  if (source instanceof ArrayBuffer) return new Blob([source]);
+  if (ArrayBuffer.isView(source)) return new Blob([copyBytes(source)]); // a Blob takes no shared memory
+  return source instanceof ReadableStream ? null : source;
+}
+
+// Opens an address (string or URL), a Blob or a File, or a ReadableStream of bytes; `keepSource` makes a Blob of bytes.
 // `name` replaces the file's. `aborter` ends the load. Throws an Error with a message for the user on failure.
 export async function openSource(source, name, aborter) {
   const file = await openUnnamed(source, aborter);
@@ -21,8 +28,6 @@ async function openUnnamed(source, aborter) {
   if (typeof source === "string" || source instanceof URL) return fetchedFile(absoluteAddress(source), aborter);
   if (source instanceof Blob) return chosenFile(source);
   if (source instanceof ReadableStream) return streamedFile(source, aborter);
-  if (source instanceof ArrayBuffer) return chosenFile(new Blob([source]));
-  if (ArrayBuffer.isView(source)) return chosenFile(new Blob([copyBytes(source)])); // a Blob takes no shared memory
   throw new Error("A scene is an address, a Blob, an ArrayBuffer, a Uint8Array or a ReadableStream.");
 }
 

@@ -8,7 +8,7 @@ import { prefersReducedMotion } from "./motion.js";
 import { Navigation } from "./navigation.js";
 import { Player } from "./player.js";
 import { Renderer } from "./renderer.js";
-import { openSource } from "./source.js";
+import { keepSource, openSource } from "./source.js";
 import { STREAMING } from "./stream/stream_loader.js";
 
 const EVENTS = ["ready", "progress", "error", "camera", "ignored"];
@@ -56,8 +56,8 @@ class Viewer {
     this.listeners = new Map(EVENTS.map((event) => [event, new Set()]));
     this.firstCamera = camera; // of the scene of the next load
     this.progress = 0;
-    // The load whose scene is wanted, `origin` of its loader: {aborter, reject: rejects its promise, firstCamera,
-    // isComplete, isReported: whether "ready" was emitted}.
+    // The load whose scene is wanted, `origin` of its loader: {aborter, reject: rejects its promise, firstCamera, name,
+    // source: what can be loaded again, null for a stream, isComplete, isReported: whether "ready" was emitted}.
     this.currentLoad = null;
     this.screenshots = 0; // those that are being made
     this.isReady = false;
@@ -161,14 +161,14 @@ class Viewer {
   async load(src, options) {
     if (this.isDestroyed) throw new Error(DESTROYED_TEXT);
     this.dropLoad();
-    const { firstCamera } = this;
-    const load = { aborter: new AbortController(), firstCamera, isComplete: false, isReported: false };
+    const { firstCamera } = this, name = options?.name;
+    const load = { aborter: new AbortController(), firstCamera, name, isComplete: false, isReported: false };
     const dropped = new Promise((_, reject) => (load.reject = reject));
     this.currentLoad = load;
     this.pending = this.firstCamera = null;
     this.isReady = false;
     this.progress = 0;
-    await Promise.race([this.show(load, src, options?.name), dropped]);
+    await Promise.race([this.show(load, src), dropped]);
   }
 
   // Aborts the current load and rejects its promise, unless a part of its scene is shown: then the rest still loads, in
@@ -189,10 +189,11 @@ class Viewer {
   }
 
   // Opens the source of a load, and emits what comes of it.
-  async show(load, src, name) {
+  async show(load, src) {
     const { player } = this, isDropped = () => this.currentLoad !== load;
     try {
-      const file = await openSource(src, name, load.aborter);
+      load.source = keepSource(src);
+      const file = await openSource(load.source ?? src, load.name, load.aborter);
       if (isDropped()) return;
       await player.open({ ...file, origin: load });
     } catch (error) {
