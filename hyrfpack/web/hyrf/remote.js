@@ -28,7 +28,7 @@ import { HyrfError, HyrfFormatError } from "./errors.js";
  * }} RemotePart
  *
  * What can be opened: an address (relative to that of the page or worker), or the content of a file.
- * @typedef {string | URL | Blob | ArrayBuffer | Uint8Array} Source
+ * @typedef {string | URL | Blob | ArrayBufferLike | ArrayBufferView} Source
  *
  * `name` is the file's name for error messages; by default it is the end of the address. `onProgress` is called with
  * the part (0 to 1) of the file that is loaded, and once, with 0, when decoding begins. `signal` cancels the opening.
@@ -239,7 +239,12 @@ async function describeSource(source) {
   if (typeof source === "string" || source instanceof URL) {
     return { address: new URL(source, globalThis.document?.baseURI ?? globalThis.location?.href).href };
   }
-  const bytes = source instanceof Blob ? await source.arrayBuffer() : source;
-  if (bytes?.byteLength === undefined) throw new TypeError("neither an address nor the content of a file");
-  return { bytes: new Uint8Array(bytes) };
+  const content = source instanceof Blob ? await source.arrayBuffer() : source;
+  if (ArrayBuffer.isView(content)) {
+    const { buffer, byteOffset, byteLength } = content;
+    return { bytes: new Uint8Array(buffer, byteOffset, byteLength).slice() }; // else the message has the whole buffer
+  }
+  const isBuffer = Object.prototype.toString.call(content).endsWith("ArrayBuffer]"); // also one of another frame
+  if (!isBuffer) throw new TypeError("neither an address nor the content of a file");
+  return { bytes: new Uint8Array(content) };
 }

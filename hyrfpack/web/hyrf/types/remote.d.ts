@@ -15,7 +15,7 @@ export type RemotePart = {
     rowCount: number;
     exposure: import("./exposure.js").ExposureMap | null;
 };
-export type Source = string | URL | Blob | ArrayBuffer | Uint8Array;
+export type Source = string | URL | Blob | ArrayBufferLike | ArrayBufferView;
 export type OpenOptions = {
     name?: string;
     onProgress?: (progress: {
