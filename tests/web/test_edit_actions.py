@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,9 @@ from web.native_models import MODEL_FRAME, encode_with_photos, random_model
 from web.scripts import run_script
 
 from hyrfpack.cli.edit import edit
+from hyrfpack.config.edit import Scale
+from hyrfpack.edit.transform import move_frame, placement_of
+from hyrfpack.errors import HyrfError
 from hyrfpack.format import load_model
 from hyrfpack.model import Frame
 
@@ -92,6 +96,24 @@ def test_the_player_keeps_the_gaussians_that_its_command_keeps(name: str, tmp_pa
         edited.gaussians.positions.detach(), model.gaussians.positions.detach()[found["left"]]
     )
     assert found["counts"][-1] == len(edited)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.0, 1e-32, 1e-31, 1.0, 1e23, 1e24, math.inf, math.nan])
+def test_the_player_scales_only_to_sizes_that_the_command_accepts(factor: float, tmp_path: Path):
+    script = tmp_path / "storable.mjs"
+    module = Path(__file__).parents[2] / "hyrfpack" / "web" / "viewer" / "edit" / "actions.js"
+    actions = json.dumps([{"option": "scale", "value": factor}])  # infinite numbers and NaN are those of JavaScript
+    scene = json.dumps({"center": FAR_FRAME.center, "unit": FAR_FRAME.scale, "up": [0, -1, 0]})
+    script.write_text(
+        f"import {{ isStorable }} from {json.dumps(module.as_uri())};\n"
+        f"console.log(JSON.stringify(isStorable({actions}, {scene})));\n"
+    )
+    try:
+        move_frame(placement_of(Scale(factor)), FAR_FRAME)
+        is_accepted = True
+    except (HyrfError, ValueError):
+        is_accepted = False
+    assert run_script(script) == is_accepted
 
 
 @pytest.mark.parametrize(

@@ -427,6 +427,18 @@ def test_the_distance_of_two_picked_points_is_that_of_the_world(browser: Browser
     assert np.allclose(window_camera(browser).camera_from_world, camera.camera_from_world), "a tap moves the eye"
 
 
+@pytest.mark.parametrize("length", [0, -3, 1e300])
+def test_a_length_that_would_lose_the_scene_is_refused(browser: Browser, tmp_path: Path, length: float):
+    load_editable_page(browser, tmp_path, make_editable_page(make_ball_model(GROUND)), "measure")
+    camera = window_camera(browser)
+    for point in GROUND[:2]:
+        browser.click(*project(browser, camera, point))
+    fill(browser, "#edit-length", length)
+    click(browser, "#edit-rescale")
+    assert read_text(browser, "done") == "No scene can have this size; type another length."
+    assert list_actions(browser) == [] and not browser.evaluate("document.getElementById('toast').hidden")
+
+
 def test_up_is_perpendicular_to_three_points_and_points_to_the_cameras(browser: Browser, tmp_path: Path):
     load_editable_page(browser, tmp_path, make_editable_page(make_ball_model(GROUND)), "up")
     camera = window_camera(browser)
@@ -531,6 +543,9 @@ def test_a_played_path_ends_at_the_last_view_and_stops_by_input(browser: Browser
     click(browser, "#edit-play")
     browser.press("ArrowLeft")
     assert read_text(browser, "edit-play") == "Play"
+    click(browser, "#edit-play")
+    click(browser, "#edit-views li:last-child button:last-child")
+    assert read_text(browser, "edit-play") == "Play", "the path of a removed view is played"
 
 
 def test_views_are_those_of_the_moved_scene(browser: Browser, tmp_path: Path):

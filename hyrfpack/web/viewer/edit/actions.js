@@ -7,6 +7,8 @@ import { add, cross, dot, mul, sub, unit } from "../../hyrf/vectors.js";
 
 const POSITION_DIGITS_IN_UNIT_SCENE = 4; // behind the decimal point
 const DIRECTION_DIGITS = 6;
+const MIN_SCENE_SIZE = 1e-30; // this limit and the next one are those of `hyrfpack edit`
+const MAX_WORLD_COORDINATE = 1e30;
 const AXIS_VECTORS = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] };
 // An action takes the place of an earlier one of the same option, unless one of these lies between.
 const SEPARATORS = { "crop-box": ["scale", "upright"], "max-scale": ["scale"], "min-opacity": [], up: ["upright"] };
@@ -45,6 +47,13 @@ export function placementAfter(actions, scene) {
     }
   }
   return { factor, rows, up };
+}
+
+// Returns whether `hyrfpack edit` accepts where actions move a scene, as move_frame in hyrfpack/edit/transform.py.
+export function isStorable(actions, scene) {
+  const { factor, rows } = placementAfter(actions, scene), size = factor * scene.unit;
+  const center = mul(rotateBy(rows, scene.center), factor), reach = Math.max(size, ...center.map(Math.abs));
+  return size >= MIN_SCENE_SIZE && reach <= MAX_WORLD_COORDINATE;
 }
 
 // Returns the rows of the rotation that maps `up` to `target`, as upright_rotation in hyrfpack/splats/placement.py: if

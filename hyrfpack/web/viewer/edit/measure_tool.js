@@ -2,6 +2,8 @@
 
 import { element } from "../dom.js";
 import { add, mul, sub } from "../../hyrf/vectors.js";
+import { toast } from "../notifications.js";
+import { isStorable } from "./actions.js";
 import { PointPicker } from "./point_picker.js";
 
 const DISTANCE_DIGITS = 4;
@@ -17,7 +19,9 @@ export class MeasureTool {
     };
     element("edit-length").oninput = () => this.refresh();
     element("edit-rescale").onclick = () => {
-      editor.set([...editor.actions, { option: "scale", value: this.factor }]);
+      const actions = [...editor.actions, { option: "scale", value: this.factor }];
+      if (isStorable(actions, editor.player.scene)) editor.set(actions);
+      else toast("No scene can have this size; type another length.");
     };
   }
 
@@ -27,9 +31,9 @@ export class MeasureTool {
     return to ? this.editor.size * Math.hypot(...sub(to, from)) : null;
   }
 
-  // The factor that gives the two points the length of the user; NaN or infinite without points or a length.
+  // The factor that gives the two points the length of the user; NaN without points or a length.
   get factor() {
-    return Number((element("edit-length").valueAsNumber / this.distance).toPrecision(FACTOR_DIGITS));
+    return Number((element("edit-length").valueAsNumber / (this.distance ?? NaN)).toPrecision(FACTOR_DIGITS));
   }
 
   get text() {
@@ -58,6 +62,6 @@ export class MeasureTool {
 
   refresh() {
     element("edit-distance").textContent = this.text;
-    element("edit-rescale").disabled = !(this.factor > 0 && this.factor < Infinity);
+    element("edit-rescale").disabled = Number.isNaN(this.factor);
   }
 }

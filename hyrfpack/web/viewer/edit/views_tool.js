@@ -82,6 +82,7 @@ export class ViewsTool {
   }
 
   remove(view) {
+    this.leave(); // the path that is played had this view
     this.views = this.views.filter((other) => other !== view);
     this.list();
   }
