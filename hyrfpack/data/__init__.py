@@ -60,8 +60,8 @@ def load_scene(
         HyrfNoPosesError: the path holds photos, or is a video, and there are no poses.
         HyrfDataError: the folder cannot be used, or `held_out` names an unknown photo or all photos. The message says
             what is wrong, where, and what to do.
-        HyrfError: a `max_size` of 1 to 15 pixels.
-        ValueError: an unknown `layout`, or a negative `test_every` or `max_size`.
+        HyrfError: `max_size` is neither 0 nor at least 16.
+        ValueError: an unknown `layout`, or a negative `test_every`.
 
     Example:
         >>> import hyrfpack
@@ -71,11 +71,9 @@ def load_scene(
     """
     if test_every < 0:
         raise ValueError(f"test_every must be 0 or more, not {test_every}")
-    if max_size < 0:
-        raise ValueError(f"max_size must be 0 (photos as they are) or more, not {max_size}")
     if not is_max_size(max_size):
         raise HyrfError(
-            f"{path}: photos that are shrunk to {max_size} pixels on the longer side show too little",
+            f"{path}: photos cannot be shrunk to {max_size} pixels on the longer side",
             fix=f"shrink them to {MIN_MAX_SIZE} pixels or more with `max_size`, or keep their size with `max_size=0`",
         )
     if layout not in (None, *LAYOUTS):
