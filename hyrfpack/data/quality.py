@@ -15,6 +15,7 @@ from hyrfpack.outputs import StrPath
 MEASURED_SIDE_PIXELS = 800
 # Photos with less sharpness are blurred in any dataset: at the measured size, the blur is several pixels wide.
 MIN_SHARPNESS = 0.4
+MIN_SHARPNESS_SIDE_PIXELS = 8  # smaller pictures have too few differences at the distances that are compared
 
 _FAR_DISTANCE_PIXELS = 4
 _NEIGHBOURS_PER_SIDE = 4
@@ -86,7 +87,8 @@ def measure_sharpness(gray: np.ndarray) -> float:
         gray: (H, W) luma in [0, 1].
 
     Returns:
-        Sharpness, 0 or more; 0 for pictures without content and for those with a side of less than 8 pixels.
+        Sharpness, 0 or more; 0 for pictures without content and for those with a side of less than
+            MIN_SHARPNESS_SIDE_PIXELS.
 
     Raises:
         ValueError: the shape is not (H, W), or a value is not finite.
@@ -101,7 +103,7 @@ def measure_sharpness(gray: np.ndarray) -> float:
         True
     """
     gray = _validated(gray)
-    if min(gray.shape) < 8:
+    if min(gray.shape) < MIN_SHARPNESS_SIDE_PIXELS:
         return 0.0
     noise = 2 * _noise(gray) ** 2
     values = []
@@ -111,8 +113,8 @@ def measure_sharpness(gray: np.ndarray) -> float:
     return _FAR_DISTANCE_PIXELS * min(values)
 
 
-def is_blurred(sharpness: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Decide which photos of a set are blurred, relative to their neighbours and to the set.
+def mark_blurred(sharpness: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Mark the photos of a set that are blurred, relative to their neighbours and to the set.
 
     A photo is blurred if its sharpness is below 0.65 of its neighbours' median, below 0.6 of the set's median, or below
     0.4. Its neighbours are up to four photos on each side, in order of capture.
@@ -127,7 +129,7 @@ def is_blurred(sharpness: Sequence[float] | np.ndarray) -> np.ndarray:
         ValueError: a value is not finite.
 
     Example:
-        >>> is_blurred([1.0, 0.95, 0.5, 1.05, 0.9]).tolist()
+        >>> mark_blurred([1.0, 0.95, 0.5, 1.05, 0.9]).tolist()
         [False, False, True, False, False]
     """
     values = np.asarray(sharpness, np.float64)

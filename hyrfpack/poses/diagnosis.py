@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hyrfpack.counts import format_count
-from hyrfpack.data.quality import is_blurred
+from hyrfpack.data.quality import mark_blurred
 from hyrfpack.data.unusable import no_photos_error, unreadable_error
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.poses.prepare import COPY_REASON_PREFIX, select_unreadable
@@ -114,7 +114,7 @@ def check_registered(folder: Path, count: int, result: Mapping[str, Any]) -> Non
 def blurred_photos(features: Mapping[str, Any]) -> frozenset[str]:
     """Return the photos that are blurred compared with the others."""
     sharpness = features["sharpness"]
-    mask = is_blurred(list(sharpness.values()))
+    mask = mark_blurred(list(sharpness.values()))
     return frozenset(name for name, blurred in zip(sharpness, mask, strict=True) if blurred)
 
 

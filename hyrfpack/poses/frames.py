@@ -13,7 +13,7 @@ from PIL import Image
 
 from hyrfpack.atomic import make_folder, write_atomic
 from hyrfpack.counts import format_count
-from hyrfpack.data.quality import is_blurred, measure_sharpness
+from hyrfpack.data.quality import mark_blurred, measure_sharpness
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.outputs import StrPath
 from hyrfpack.poses.motion import TRACKING_SIDE_PIXELS, motion_distances, track_windows
@@ -234,7 +234,7 @@ def _choose_spaced_frames(
     path: Path, measured: _VideoMeasurement, max_frames: int, progress: Progress
 ) -> tuple[dict[int, float], FrameReport]:
     """Return the frames to take, as number -> time in seconds, and the report about them."""
-    blurred = is_blurred(measured.sharpness)
+    blurred = mark_blurred(measured.sharpness)
     if blurred.all():
         raise HyrfDataError(
             f"{path}: all frames of the video are blurred",

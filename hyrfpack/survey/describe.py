@@ -15,7 +15,7 @@ from hyrfpack.data import load_scene, pose_commands
 from hyrfpack.data.archive import is_archive, unpack
 from hyrfpack.data.folder import PhotoFacts, list_photos, list_raw_photos
 from hyrfpack.data.preset import detect_preset
-from hyrfpack.data.quality import is_blurred
+from hyrfpack.data.quality import mark_blurred
 from hyrfpack.data.unusable import (
     no_photos_error,
     raise_if_single_photo,
@@ -55,7 +55,8 @@ class PhotoSurvey:
         sizes: number of photos by size, such as "4032 x 3024", of upright pictures; the most frequent first.
         cameras: number of photos by camera, such as "Apple iPhone 12, 26 mm", of the photos whose headers were read.
         decoded: number of photos whose pixels were measured; the next four values describe these photos.
-        sharpness: median sharpness, about 1 for pictures that are sharp to the pixel; 0 for a video.
+        sharpness: median sharpness, about 1 for pictures that are sharp to the pixel; 0 for a video, and for photos
+            that are too small to measure.
         blurred: names of photos that are blurred compared with the others.
         stops: difference in stops between the 5 % and 95 % quantiles of the mean luminance; 0 for a video.
         luminance: median of the mean linear luminance, in [0, 1]; 0 for a video.
@@ -125,15 +126,17 @@ def _describe(path: Path, report_progress: Progress) -> PhotoSurvey:
     unreadable |= undecodable
     if not measurements:
         raise unreadable_error(path, unreadable, len(photos))
-    blurred_mask = is_blurred([measurement.sharpness for measurement in measurements])
-    blurred = [item.path for item, blurred in zip(measurements, blurred_mask, strict=True) if blurred]
+    sharpness = {item.path: item.sharpness for item in measurements if item.sharpness is not None}
+    median_sharpness = float(np.median([*sharpness.values()])) if sharpness else 0.0
+    mask = mark_blurred([*sharpness.values()])
+    blurred = [path for path, is_blurred in zip(sharpness, mask, strict=True) if is_blurred]
     log_luminances = np.log2([max(measurement.exposure.luminance, 1e-6) for measurement in measurements])
     stops = float(np.ptp(np.quantile(log_luminances, (0.05, 0.95))))
 
     problems += find_count_problems(len(photos), scene, len(posed), path)
     problems += unreadable_sentences(unreadable, len(photos))
     problems += find_copy_problems(photos, measurements, unreadable, folder, report_progress)
-    problems += find_blur_problems(measurements, blurred, folder)
+    problems += find_blur_problems(median_sharpness, blurred, folder)
     problems += find_light_problems(measurements, log_luminances, stops, folder, scene)
     if scene is None:
         problems += find_zoom_problems(facts) + find_mask_problems(folder, photos)
@@ -155,7 +158,7 @@ def _describe(path: Path, report_progress: Progress) -> PhotoSurvey:
         sizes=_count_values(f"{fact.size[0]} x {fact.size[1]}" for fact in facts),
         cameras=_count_values(_describe_camera(fact) for fact in facts),
         decoded=len(measurements),
-        sharpness=round(float(np.median([measurement.sharpness for measurement in measurements])), 3),
+        sharpness=round(median_sharpness, 3),
         blurred=tuple(relative_name(item, folder) for item in blurred),
         stops=round(stops, 2),
         luminance=round(float(2 ** np.median(log_luminances)), 4),

@@ -11,7 +11,7 @@ from PIL import Image
 
 from hyrfpack.data.archive import display_path
 from hyrfpack.data.folder import PhotoFacts, read_photo_facts
-from hyrfpack.data.quality import Exposure, measure_exposure, measure_sharpness, read_gray
+from hyrfpack.data.quality import MIN_SHARPNESS_SIDE_PIXELS, Exposure, measure_exposure, measure_sharpness, read_gray
 from hyrfpack.errors import HyrfDataError, strip_path
 from hyrfpack.parallel.threads import thread_count
 from hyrfpack.progress import Progress, TaskEvent
@@ -32,13 +32,13 @@ class PhotoMeasurement:
 
     Attributes:
         path: the photo.
-        sharpness: its sharpness.
+        sharpness: its sharpness; None for a picture that is too small to measure.
         exposure: its luminance and clipping.
         thumbnail: (_THUMBNAIL_SIDE_PIXELS, _THUMBNAIL_SIDE_PIXELS) grey levels in [0, 255].
     """
 
     path: Path
-    sharpness: float
+    sharpness: float | None
     exposure: Exposure
     thumbnail: np.ndarray
 
@@ -84,7 +84,8 @@ def _measure_one(path: Path) -> PhotoMeasurement | str:
     except HyrfDataError as error:
         return strip_path(error, display_path(path))
     small = Image.fromarray(gray).resize((_THUMBNAIL_SIDE_PIXELS, _THUMBNAIL_SIDE_PIXELS), Image.Resampling.BOX)
-    return PhotoMeasurement(path, measure_sharpness(gray), measure_exposure(gray), 255 * np.asarray(small))
+    sharpness = measure_sharpness(gray) if min(gray.shape) >= MIN_SHARPNESS_SIDE_PIXELS else None
+    return PhotoMeasurement(path, sharpness, measure_exposure(gray), 255 * np.asarray(small))
 
 
 def relative_name(path: Path, folder: Path) -> str:

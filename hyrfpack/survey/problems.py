@@ -100,7 +100,9 @@ def find_copy_problems(
         else:
             not_hashed.append(group)
     hashed = _group_files(report_each(to_hash, middle, 1.0), lambda photo: hashlib.sha256(photo.read_bytes()).digest())
-    copies = [(photo, first) for first, *others in [*hashed.values(), *not_hashed] for photo in others]
+    # Programs add to the name of a copy, so the original has the shortest name.
+    groups = [sorted(group, key=lambda photo: len(photo.name)) for group in [*hashed.values(), *not_hashed]]
+    copies = [(photo, first) for first, *others in groups for photo in others]
     if not copies:
         return []
     first, of = (relative_name(item, folder) for item in copies[0])
@@ -129,16 +131,15 @@ def _digest_samples(file: Path) -> bytes:
     return digest.digest()
 
 
-def find_blur_problems(measurements: list[PhotoMeasurement], blurred: list[Path], folder: Path) -> list[str]:
+def find_blur_problems(median_sharpness: float, blurred: list[Path], folder: Path) -> list[str]:
     """Describe a blurred set, or its blurred photos."""
-    values = [measurement.sharpness for measurement in measurements]
-    if np.median(values) < MIN_SHARPNESS:
+    if not blurred:
+        return []
+    if median_sharpness < MIN_SHARPNESS:
         return [
             "most photos are blurred; take them again with the camera held still, in more light, and "
             "focused on what you photograph"
         ]
-    if not blurred:
-        return []
     names = format_file_names([relative_name(item, folder) for item in blurred])
     return [
         f"{format_count(len(blurred), 'photo is', 'photos are')} blurred ({names}); leave out or retake blurred photos"

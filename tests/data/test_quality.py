@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from hyrfpack.data.quality import MIN_SHARPNESS, is_blurred, measure_exposure, measure_sharpness, read_gray
+from hyrfpack.data.quality import MIN_SHARPNESS, mark_blurred, measure_exposure, measure_sharpness, read_gray
 
 
 def random_rectangles(seed: int = 0, side: int = 128) -> np.ndarray:
@@ -74,18 +74,18 @@ def test_arrays_that_are_no_picture_are_rejected():
     with pytest.raises(ValueError, match="finite"):
         measure_sharpness(np.full((20, 20), np.nan))
     with pytest.raises(ValueError, match="finite"):
-        is_blurred([1.0, np.inf])
+        mark_blurred([1.0, np.inf])
 
 
-def test_a_photo_is_blurred_relative_to_its_neighbours_to_the_set_or_absolutely():
+def test_a_photo_mark_blurred_relative_to_its_neighbours_to_the_set_or_absolutely():
     beside = [1.0] * 9 + [0.62] + [1.0] * 9
-    assert np.flatnonzero(is_blurred(beside)).tolist() == [9]
+    assert np.flatnonzero(mark_blurred(beside)).tolist() == [9]
     run = [1.0] * 20 + [0.5] * 9 + [1.0] * 20  # the middle one has only blurred neighbours
-    assert np.flatnonzero(is_blurred(run)).tolist() == list(range(20, 29))
+    assert np.flatnonzero(mark_blurred(run)).tolist() == list(range(20, 29))
     slow_change = np.linspace(1.2, 0.8, 40)
-    assert not is_blurred(slow_change).any()
-    assert is_blurred([MIN_SHARPNESS / 2] * 5).all()
-    assert is_blurred([]).shape == (0,) and not is_blurred([0.9]).any()
+    assert not mark_blurred(slow_change).any()
+    assert mark_blurred([MIN_SHARPNESS / 2] * 5).all()
+    assert mark_blurred([]).shape == (0,) and not mark_blurred([0.9]).any()
 
 
 def test_exposure_is_measured_in_linear_light_with_the_clipped_share():
