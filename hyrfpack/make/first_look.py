@@ -15,7 +15,7 @@ from hyrfpack.context import RunContext
 from hyrfpack.data import load_scene
 from hyrfpack.data.folder import first_readable_photo, list_photos, read_photo_facts
 from hyrfpack.data.pictures import fit_size, read_pixels
-from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.errors import HyrfDataError
 from hyrfpack.logs import log_only_errors_of
 from hyrfpack.parallel.threads import thread_count
 from hyrfpack.progress import Event, Progress, StepEvent, TaskEvent
@@ -60,8 +60,8 @@ def show_first_look(
             if not _reduce_photos(photos, folder / "photos"):
                 return
             _train_coarse_model(folder, config, observer, context)
-    except (HyrfError, OSError) as error:
-        _LOG.info(f"the first look is skipped: {error}")
+    except Exception as error:  # the scene can be made without a first look, whatever went wrong
+        _LOG.info(f"the first look is skipped: {str(error) or type(error).__name__}")
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

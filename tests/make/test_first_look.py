@@ -87,6 +87,21 @@ def test_a_failed_first_look_is_logged_and_the_estimation_goes_on(make, photos, 
     assert result.output.is_file() and not (result.work / "first_look").exists()
 
 
+@pytest.mark.usefixtures("fake_stages")
+@pytest.mark.parametrize(
+    ("error", "reason"), [(MemoryError(), "MemoryError"), (RuntimeError("no kernel"), "no kernel")]
+)
+def test_no_error_in_the_first_look_ends_the_call(error, reason, make, photos, poses, caplog):
+    def fail(trainer) -> None:
+        if trainer.kind == "first look":
+            raise error
+
+    with caplog.at_level(logging.INFO, "hyrfpack"):
+        result = make(observer=fail)
+    assert f"the first look is skipped: {reason}" in caplog.messages
+    assert result.output.is_file() and not (result.work / "first_look").exists()
+
+
 def test_photos_may_lie_in_a_folder_and_its_subfolders(photos, tmp_path):
     paths = sorted(photos.iterdir())
     for depth, path in enumerate(paths[:6]):
