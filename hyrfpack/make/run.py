@@ -184,7 +184,7 @@ def make_observed_scene(
                     return _Pipeline(request, observer, start_seconds, context, progress).run()
         except Stopped:
             raise
-        except KeyboardInterrupt as error:  # interrupted before or between the stages
+        except KeyboardInterrupt as error:  # interrupted before the stages
             raise Stopped("preparation") from error
 
 
@@ -219,6 +219,19 @@ class _Pipeline:
         self.stage_cache = StageCache(request.work, self.reporter, request.check_replacing)
 
     def run(self) -> MakeResult:
+        """Run all stages that the source needs.
+
+        Raises:
+            Stopped: the call was interrupted in a stage or after it.
+        """
+        try:
+            return self._run_stages()
+        except Stopped:
+            raise
+        except KeyboardInterrupt as error:
+            raise Stopped(self.stage_cache.stage) from error
+
+    def _run_stages(self) -> MakeResult:
         """Run all stages that the source needs."""
         kind = self.source.kind
         if kind == "model":

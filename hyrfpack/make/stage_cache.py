@@ -34,7 +34,7 @@ class Stopped(KeyboardInterrupt):
     """The work was interrupted by Ctrl-C, SIGTERM or the closing of its terminal; the same call resumes it.
 
     Attributes:
-        stage: name of the interrupted stage.
+        stage: name of the interrupted stage, or of the latest one after which the call was interrupted.
         preview: file with a preview of the unfinished scene; None if there is none.
     """
 
@@ -51,6 +51,7 @@ class StageCache:
         folder: the work folder, which holds the products.
         state: the record of the work folder.
         reporter: reports progress.
+        stage: name of the latest stage, also while it runs; "preparation" before the first one.
         kept: names of stages whose products were reused.
         seconds: time that each stage has taken in all calls together.
     """
@@ -72,6 +73,7 @@ class StageCache:
         self.folder = folder
         self.state = WorkFolderState(folder)
         self.reporter = reporter
+        self.stage = "preparation"
         self.kept: list[str] = []
         self.seconds: dict[str, float] = {}
         self._check_replacing = check_replacing
@@ -100,6 +102,7 @@ class StageCache:
             Stopped: the stage was interrupted.
             HyrfError: the stage failed.
         """
+        self.stage = name
         facts = self.state.facts(name, inputs)
         if facts is not None:
             self.kept.append(name)

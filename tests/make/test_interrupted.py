@@ -18,7 +18,7 @@ from hyrfpack.atomic import TEMPORARY_PREFIX
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.make import Stopped, make_scene, stages
+from hyrfpack.make import Stopped, make_scene, run, stages
 from hyrfpack.make.preview import PREVIEW_FILE
 from hyrfpack.make.stage_cache import interruptible
 from hyrfpack.progress import StageEvent, StepEvent
@@ -82,6 +82,17 @@ def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products,
     assert list(result.kept) == done[:-1]
 
 
+def test_an_interrupt_between_two_stages_names_the_finished_one(posed, tmp_path, monkeypatch):
+    def stop(stage_cache):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "remove_preview", stop)
+        with pytest.raises(Stopped, match="stopped in training"):
+            make_scene(posed, tmp_path / "scene.html")
+    assert make_scene(posed, tmp_path / "scene.html").kept == ("training",)
+
+
 def test_an_interrupt_on_a_full_disk_is_still_an_interrupt(posed, tmp_path, monkeypatch):
     def fill_disk_and_stop(*arguments, **options):
         monkeypatch.setattr("hyrfpack.make.state.write_atomic", fail)
@@ -122,7 +133,7 @@ def test_a_partly_copied_output_is_completed(copied, posed, tmp_path, monkeypatc
 
     with monkeypatch.context() as patch:
         patch.setattr(stages, "copy_if_different", stop)
-        with pytest.raises(Stopped):
+        with pytest.raises(Stopped, match="stopped in export"):
             make_scene(posed, tmp_path / "player", MakeConfig(quality="draft"))
     assert len(list((tmp_path / "player").iterdir())) == copied
     completed = make_scene(posed, tmp_path / "player", MakeConfig(quality="draft")).output
