@@ -21,6 +21,7 @@ from hyrfpack.make.plan import (
     QUALITIES,
     Plan,
     count_packing_passes,
+    estimate_depth_map_seconds,
     estimate_scene_seconds,
     mean_megapixels,
 )
@@ -88,7 +89,8 @@ class SceneCost:
         density = DensityConfig()
         step = self.step_seconds + self.step_seconds_per_gaussian * density.mean_count(budget, budget)
         step *= PhotoSize.of_views(scene.train).mean_step_cost(density, budget, budget)
-        return TRAINED_PACE_RATIO * steps * step + self.decoding_seconds * min(steps, len(scene.train))
+        waiting = self.decoding_seconds * min(steps, len(scene.train)) + estimate_depth_map_seconds(len(scene.train))
+        return TRAINED_PACE_RATIO * steps * step + waiting
 
     def seconds_after_training(self, scene: Scene, steps: int) -> dict[str, float]:
         """Estimate the seconds of the work after the last training step, by part of a stage, see `STAGE_PARTS`."""

@@ -25,6 +25,7 @@ from hyrfpack.train.length_pilots import max_length_pilot_steps
 from hyrfpack.train.pilots import BUDGET_REFERENCE_STEPS
 from hyrfpack.train.resolution import PhotoSize
 from hyrfpack.train.setup import budget_for, usual_budget
+from hyrfpack.train.surface_depths import MAX_PHOTOS
 
 # Measured on two CPU cores, for the first estimate only; during the work, measured times replace it.
 CPU_STEP_SECONDS = 0.03  # time of a training step that does not depend on the photo's size
@@ -34,6 +35,7 @@ CPU_PASS_SECONDS_PER_MEGAPIXEL = 0.6  # a pass renders a view and back-propagate
 BACKGROUND_SEARCH_PASSES = 8.0  # time of the search for a background in unseen directions
 PASSES_PER_SCORED_VIEW = 2.0  # time of scoring a held-out photo and writing its picture
 POSE_SECONDS_PER_PHOTO = 3.0
+DEPTH_MAP_SECONDS_PER_PHOTO = 0.1  # depth maps are as small for large photos as for small ones
 # Before a video is decoded, number and size of its photos are unknown.
 ASSUMED_VIDEO_PHOTOS = 100
 ASSUMED_VIDEO_SIZE = (1920, 1080)
@@ -148,10 +150,16 @@ def mean_megapixels(scene: Scene) -> float:
     return float(np.mean([view.camera.width * view.camera.height for view in scene.views])) / 1e6
 
 
+def estimate_depth_map_seconds(trained: int) -> float:
+    """Return the seconds in which a training run on `trained` photos estimates depth maps for its initial points."""
+    return DEPTH_MAP_SECONDS_PER_PHOTO * min(trained, MAX_PHOTOS)
+
+
 def estimate_seconds(
     size: PhotoSize,
     plan: Plan,
     gaussians: int,
+    trained: int,
     held_out: int,
     pilot_steps: float,
     device: torch.device,
@@ -162,6 +170,7 @@ def estimate_seconds(
         size: size of the photos.
         plan: the plan.
         gaussians: expected number of Gaussians; training starts with at most as many.
+        trained: number of photos that are trained on.
         held_out: number of photos that are scored.
         pilot_steps: number of steps of all pilot runs, see `max_pilot_steps`.
         device: device of the training.
@@ -182,7 +191,7 @@ def estimate_seconds(
     )
     return {
         "pilots": pilot_steps * pilot_step_seconds,
-        "training": 2 + plan.steps * step_seconds,
+        "training": 2 + estimate_depth_map_seconds(trained) + plan.steps * step_seconds,
         "results": 2 + (BACKGROUND_SEARCH_PASSES + scoring_passes) * megapixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
         "compression": 3
         + (count_packing_passes(gaussians) + 3 * plan.finetune_steps) * megapixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
@@ -196,7 +205,8 @@ def estimate_scene_seconds(scene: Scene, plan: Plan, device: torch.device) -> di
     config = plan.train_config(seed=0)
     gaussians, _ = budget_for(scene, config)
     size = PhotoSize.of_views(scene.train)
-    return estimate_seconds(size, plan, gaussians, len(scene.test), max_pilot_steps(scene, config), device)
+    pilot_steps = max_pilot_steps(scene, config)
+    return estimate_seconds(size, plan, gaussians, len(scene.train), len(scene.test), pilot_steps, device)
 
 
 def expected_photo_size(size: tuple[int, int] | None, max_size: int) -> PhotoSize:
@@ -214,5 +224,5 @@ def estimate_photos_seconds(count: int, size: PhotoSize, plan: Plan, device: tor
     pilot_steps += max_length_pilot_steps(trained, plan.steps) * plan.early_stop
     return {
         "poses": POSE_SECONDS_PER_PHOTO * count,
-        **estimate_seconds(size, plan, gaussians, count // 8, pilot_steps, device),
+        **estimate_seconds(size, plan, gaussians, trained, count // 8, pilot_steps, device),
     }

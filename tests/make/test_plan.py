@@ -6,11 +6,13 @@ import pytest
 import torch
 
 from hyrfpack.make.plan import (
+    DEPTH_MAP_SECONDS_PER_PHOTO,
     LARGE_PHOTO_PIXELS,
     QUALITIES,
     SMALL_PHOTO_PIXELS,
     Plan,
     estimate_photos_seconds,
+    estimate_seconds,
     expected_photo_size,
 )
 from hyrfpack.train.resolution import PhotoSize
@@ -72,3 +74,11 @@ def test_the_estimate_grows_with_photos_pixels_and_steps():
     assert seconds(120, 800, 1_000)["poses"] > usual["poses"]
     assert seconds(60, 1600, 1_000)["training"] > usual["training"]
     assert seconds(60, 800, 3_000)["training"] > usual["training"]
+
+
+def test_the_estimate_of_the_training_includes_depth_maps_of_at_most_100_photos():
+    def training_seconds(trained):
+        return estimate_seconds(PhotoSize(250_000, 500), Plan(1_000, 800), 5_000, trained, 0, 0, CPU_DEVICE)["training"]
+
+    assert training_seconds(50) - training_seconds(0) == pytest.approx(50 * DEPTH_MAP_SECONDS_PER_PHOTO)
+    assert training_seconds(1_000) == training_seconds(100) > training_seconds(99)
