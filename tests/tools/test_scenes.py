@@ -201,6 +201,12 @@ def test_a_set_replaces_an_earlier_one_with_more_photos(tmp_path, capsys):
     assert "3 photos of 48 x 32 pixels" in capsys.readouterr().out
 
 
+def test_a_set_without_points_gets_a_note(tmp_path, capsys):
+    command.main(["--out", str(tmp_path), "--scenes", "object", "--width", "48", "--photos", "3"])
+    assert "0 points" in (printed := capsys.readouterr().out)
+    assert f"{tmp_path / 'object'}: it has no points; render more or larger photos" in printed
+
+
 def test_a_failure_leaves_nothing_half_written(tmp_path, monkeypatch):
     def fail(*arguments: object) -> None:
         raise KeyboardInterrupt

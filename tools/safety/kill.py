@@ -34,7 +34,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 from PIL import Image
@@ -107,10 +107,19 @@ class Outcome:
     faults: list[str]
 
 
-def start_command(arguments: list[str]) -> subprocess.Popen:
-    """Start a hyrfpack command as a child process."""
+def start_command(arguments: list[str], log: IO[bytes]) -> subprocess.Popen:
+    """Start a hyrfpack command as a child process whose standard error goes to the file `log`.
+
+    A pipe would make the command wait once it is full, because nothing reads it while temporary files are searched.
+    """
     command = [sys.executable, "-m", "hyrfpack", *arguments]
-    return subprocess.Popen(command, env=COMMAND_ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    return subprocess.Popen(command, env=COMMAND_ENVIRONMENT, stdout=subprocess.DEVNULL, stderr=log)
+
+
+def read_log(log: IO[bytes]) -> str:
+    """Return the standard error of a command that has ended."""
+    log.seek(0)
+    return log.read().decode()
 
 
 def is_temporary_file(name: str) -> bool:
@@ -195,10 +204,9 @@ def check_rerun(case: Case, out: Path) -> list[str]:
     arguments = case.arguments(out)
     if (out / CHECKPOINT_FILE).exists():
         arguments = [argument if argument != "--overwrite" else "--resume" for argument in arguments]
-    process = start_command(arguments)
-    _, stderr_text = process.communicate()
-    if process.returncode:
-        return [f"run again, it exits with {process.returncode}: {stderr_text.decode()[-300:]}"]
+    with tempfile.TemporaryFile() as log:
+        if code := start_command(arguments, log).wait():
+            return [f"run again, it exits with {code}: {read_log(log)[-300:]}"]
     final_files = read_files(out)
     faults = [f"run again: {sentence}" for sentence in find_faults(final_files, case)]
     faults += [
@@ -220,15 +228,17 @@ def run_trial(case: Case, number: int, seed: int, out: Path) -> Outcome:
     for name, data in case.old.items():
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         (out / name).write_bytes(data)
-    process = start_command(case.arguments(out))
-    if number % 2:
-        wait_for_temporary_files(process, out, random_source.randint(1, case.writes))
-        time.sleep(random_source.uniform(0, MAX_KILL_DELAY_SECONDS))
-    else:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(random_source.uniform(0, case.seconds))
-    process.kill()
-    _, stderr_text = process.communicate()
+    with tempfile.TemporaryFile() as log:
+        process = start_command(case.arguments(out), log)
+        if number % 2:
+            wait_for_temporary_files(process, out, random_source.randint(1, case.writes))
+            time.sleep(random_source.uniform(0, MAX_KILL_DELAY_SECONDS))
+        else:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(random_source.uniform(0, case.seconds))
+        process.kill()
+        process.wait()
+        stderr_text = read_log(log)
     files = read_files(out)
     temporary_files = sum(map(is_temporary_file, files))
     outcome = Outcome(
@@ -238,7 +248,7 @@ def run_trial(case: Case, number: int, seed: int, out: Path) -> Outcome:
         find_faults(files, case),
     )
     if process.returncode not in (0, -signal.SIGKILL):
-        outcome.faults.append(f"it ended by itself with {process.returncode}: {stderr_text.decode()[-300:]}")
+        outcome.faults.append(f"it ended by itself with {process.returncode}: {stderr_text[-300:]}")
     if temporary_files or number % RERUN_EVERY == 0:
         outcome.was_rerun = True
         outcome.faults += check_rerun(case, out)
@@ -276,12 +286,12 @@ def prepare(work_folder: Path, names: Sequence[str]) -> list[Case]:
         for seed in (1, 0):
             out = work_folder / f"{name}-{seed}"
             out.mkdir()
-            process, started = start_command(arguments(out, seed)), time.perf_counter()
-            case.writes = max(1, wait_for_temporary_files(process, out))
-            case.seconds = time.perf_counter() - started
-            if process.returncode:
-                stderr_text = process.stderr.read().decode()
-                raise SystemExit(f"{' '.join(process.args)}: exit {process.returncode}\n{stderr_text}")
+            with tempfile.TemporaryFile() as log:
+                process, started = start_command(arguments(out, seed), log), time.perf_counter()
+                case.writes = max(1, wait_for_temporary_files(process, out))
+                case.seconds = time.perf_counter() - started
+                if process.returncode:
+                    raise SystemExit(f"{' '.join(process.args)}: exit {process.returncode}\n{read_log(log)}")
         case.old, case.new = read_files(work_folder / f"{name}-1"), read_files(work_folder / f"{name}-0")
         cases.append(case)
     return cases

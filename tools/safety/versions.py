@@ -23,7 +23,7 @@ from pathlib import Path
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
 ENVIRONMENTS_FOLDER = REPOSITORY_ROOT / ".versions"
-PYTHON_VERSIONS = {"newest": ("3.10", "3.11", "3.12", "3.13", "3.14"), "oldest": ("3.10",)}
+PYTHON_VERSIONS = {"newest": ("3.10", "3.11", "3.12", "3.13"), "oldest": ("3.10",)}
 UV_RESOLUTIONS = {"newest": "highest", "oldest": "lowest-direct"}  # values of uv's option --resolution
 PRINTED_PACKAGES = ("torch", "numpy", "numba", "pycolmap", "pillow", "click")
 PRINT_VERSIONS_SCRIPT = (

@@ -179,6 +179,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"{time.perf_counter() - start:.0f} s",
             flush=True,
         )
+        if not len(points.positions):
+            print(f"{folder}: it has no points; render more or larger photos (--photos, --width)", flush=True)
 
 
 if __name__ == "__main__":
