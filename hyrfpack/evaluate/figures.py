@@ -100,7 +100,7 @@ def draw_contact_sheet(rows: Sequence[Image.Image], title: str, lines: Sequence[
     margin, line = 2 * GAP_PIXELS, round(1.5 * text.size)
     top = margin + round(1.8 * large.size)
     header = top + line * len(lines) + margin
-    width = max(width, *(math.ceil(text.getlength(text_line)) for text_line in lines))
+    width = max([width, *(math.ceil(text.getlength(text_line)) for text_line in lines)])
     height = header + sum(row.height + GAP_PIXELS for row in rows) + margin
     sheet = Image.new("RGB", (width + 2 * margin, height), PAPER_COLOR)
     draw = ImageDraw.Draw(sheet)

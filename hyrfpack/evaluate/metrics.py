@@ -69,7 +69,7 @@ def provenance_mse(provenance: dict) -> float:
         provenance: provenance of the file. Its `psnr` is used, or ASSUMED_PSNR_DB if that is missing or out of range.
     """
     psnr_db = provenance.get("psnr")
-    if not isinstance(psnr_db, int | float) or not 0 < psnr_db < IDENTICAL_PSNR:
+    if isinstance(psnr_db, bool) or not isinstance(psnr_db, int | float) or not 0 < psnr_db < IDENTICAL_PSNR:
         psnr_db = ASSUMED_PSNR_DB
     return math.exp(-psnr_db / 10 * math.log(10))
 

@@ -23,7 +23,7 @@ from hyrfpack.evaluate.figures import (
     split_comparison,
 )
 from hyrfpack.evaluate.lpips import LPIPS
-from hyrfpack.evaluate.metrics import psnr, ssim, to_8bit
+from hyrfpack.evaluate.metrics import provenance_mse, psnr, ssim, to_8bit
 from hyrfpack.measure.psnr import IDENTICAL_PSNR
 from hyrfpack.render.files import render_files
 from hyrfpack.scene import Picture, View
@@ -349,6 +349,18 @@ def test_contact_sheet_is_wide_enough_for_its_text():
     row = draw_comparison(torch.zeros(20, 401, 3), torch.zeros(20, 401, 3))
     sheet = draw_contact_sheet([row, row], "title", ["x" * 300])
     assert sheet.width > 300 * 5 and sheet.height > 2 * row.height
+
+
+def test_contact_sheet_needs_no_text_below_its_title():
+    row = draw_comparison(torch.zeros(20, 30, 3), torch.zeros(20, 30, 3))
+    sheet = draw_contact_sheet([row], "title", [])
+    assert sheet.width > row.width and sheet.height < draw_contact_sheet([row], "title", ["text"]).height
+
+
+@pytest.mark.parametrize("psnr_db", [True, float("nan"), 0, "30", None])
+def test_a_stated_psnr_that_is_no_psnr_is_replaced_by_the_assumed_one(psnr_db):
+    assert provenance_mse({"psnr": psnr_db}) == provenance_mse({})
+    assert provenance_mse({"psnr": 30}) == pytest.approx(1e-3)
 
 
 def test_training_curve_is_a_picture(tmp_path):
