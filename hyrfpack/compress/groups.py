@@ -12,9 +12,9 @@ from hyrfpack.compress.rate_distortion import (
     choose_symbols,
     estimate_code_bits,
 )
-from hyrfpack.format.compact.groups import ENTROPY_MODEL_COUNT, MAX_ABS_SYMBOL, GroupSymbols, StepGroups, iter_blocks
+from hyrfpack.format.compact.groups import ENTROPY_MODEL_COUNT, GroupSymbols, StepGroups, iter_blocks
 from hyrfpack.quant.rans import uses_numba
-from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step
+from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, MAX_ABS_SYMBOL, decode_step
 
 # Lower bound of a number's sensitivity, as a share of the mean of its group.
 _MIN_RELATIVE_SENSITIVITY = 0.01

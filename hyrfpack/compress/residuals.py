@@ -15,9 +15,9 @@ from hyrfpack.compress.rate_distortion import (
 )
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.format.compact.groups import iter_blocks
-from hyrfpack.format.compact.residuals import MAX_ABS_SYMBOL, ResidualSymbols, residual_bands
+from hyrfpack.format.compact.residuals import ResidualSymbols, residual_bands
 from hyrfpack.format.sections import HARMONICS
-from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
+from hyrfpack.quant.steps import FIXED_POINT_ONE, MAX_ABS_SYMBOL, decode_step
 
 # Statistics of the symbols depend on which Gaussians have residuals, and the other way round.
 SELECTION_ROUNDS = 3

@@ -19,7 +19,7 @@ from hyrfpack.compress.quantize import SATURATION_LOGIT, quantize
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.format.arrays import SECTION_PARAMETERS, iter_parameters
 from hyrfpack.format.compact.channels import MAX_ABS_CHANNEL_VALUE
-from hyrfpack.format.compact.groups import MAX_ABS_SYMBOL, StepGroups
+from hyrfpack.format.compact.groups import StepGroups
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.format.compact.quantized import LOGIT_COLUMNS
 from hyrfpack.format.sections import COLORS, LOGIT_SECTIONS, OPACITIES, POSITIONS, RESIDUAL_SECTIONS, SCALES
@@ -27,7 +27,7 @@ from hyrfpack.model import HybridModel, expand
 from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.parallel.pool import parallel_map
 from hyrfpack.quant.lifting import iter_levels
-from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step
+from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, MAX_ABS_SYMBOL, decode_step
 
 # A group that is stored as zeros has a step so large that all its numbers are rounded to zero.
 ALL_ZERO_STEP = 1e300

@@ -8,13 +8,12 @@ import numpy as np
 
 from hyrfpack.compress.residuals import split_colors
 from hyrfpack.format.compact.residuals import (
-    MAX_ABS_SYMBOL,
     ResidualSymbols,
     decode_residual_symbols,
     encode_residuals,
     residual_bands,
 )
-from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
+from hyrfpack.quant.steps import FIXED_POINT_ONE, MAX_ABS_SYMBOL, decode_step
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 FIXED_POINT_ONE = 1 << 24  # The unit of fixed-point numbers is 2^-24.
+MAX_ABS_SYMBOL = 1 << 24  # Numbers and residuals of files are at most this many steps in magnitude.
 ALL_ZERO_CODE = 0  # A group with this code has only zeros, so no symbols are stored.
 
 

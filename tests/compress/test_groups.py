@@ -14,13 +14,12 @@ from hyrfpack.compress.groups import quantize_groups
 from hyrfpack.compress.rate_distortion import choose_step_codes, choose_symbols, estimate_code_bits
 from hyrfpack.format.compact.groups import (
     ENTROPY_MODEL_COUNT,
-    MAX_ABS_SYMBOL,
     GroupSymbols,
     StepGroups,
     decode_groups,
     encode_groups,
 )
-from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step
+from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, MAX_ABS_SYMBOL, decode_step
 
 
 def random_groups(count: int, groups: int, seed: int = 0) -> StepGroups:

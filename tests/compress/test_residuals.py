@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from hyrfpack.compress.residuals import quantize_residuals
-from hyrfpack.format.compact.residuals import MAX_ABS_SYMBOL, decode_residual_symbols, encode_residuals
+from hyrfpack.format.compact.residuals import decode_residual_symbols, encode_residuals
 from hyrfpack.format.sections import HARMONICS
+from hyrfpack.quant.steps import MAX_ABS_SYMBOL
 
 
 @pytest.mark.parametrize("value", [1e5, -1e5])

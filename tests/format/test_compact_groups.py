@@ -13,7 +13,6 @@ from property_tests import examples
 
 from hyrfpack.compress.groups import quantize_groups
 from hyrfpack.format.compact.groups import (
-    MAX_ABS_SYMBOL,
     StepGroups,
     decode_groups,
     decode_usage_classes,
@@ -22,6 +21,7 @@ from hyrfpack.format.compact.groups import (
 )
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import encode_integers
+from hyrfpack.quant.steps import MAX_ABS_SYMBOL
 
 
 def random_groups(count: int, groups: int, seed: int = 0) -> StepGroups:

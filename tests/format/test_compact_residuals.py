@@ -13,7 +13,6 @@ from property_tests import examples
 
 from hyrfpack.format.compact.residuals import (
     BASIS_BYTES,
-    MAX_ABS_SYMBOL,
     MAX_RESIDUAL_CLASSES,
     ResidualSymbols,
     decode_residual_symbols,
@@ -24,6 +23,7 @@ from hyrfpack.format.compact.residuals import (
 from hyrfpack.format.sections import HARMONICS, SHAPES
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import encode_integers
+from hyrfpack.quant.steps import MAX_ABS_SYMBOL
 from tools.safety import minimal_reader
 
 SHAPE_COLUMNS = 5

@@ -19,7 +19,6 @@ from scenes import camera_at, small_model
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import decode_model, encode_model
 from hyrfpack.format.codec import PROFILES
-from hyrfpack.format.compact.groups import MAX_ABS_SYMBOL as LARGEST_SYMBOL
 from hyrfpack.format.compact.plan import Plan
 from hyrfpack.model import HashGridConfig, HybridModel
 from hyrfpack.model.hash_grid import FEATURES_PER_LEVEL
@@ -33,6 +32,7 @@ from hyrfpack.quant import (
     huffman_encode,
 )
 from hyrfpack.quant.huffman import MAX_CODE_BITS
+from hyrfpack.quant.steps import MAX_ABS_SYMBOL as LARGEST_SYMBOL
 from hyrfpack.render import render_view
 from tools.safety.synthetic_encoding import quantize_uniformly
 

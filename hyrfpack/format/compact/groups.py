@@ -19,10 +19,9 @@ import numpy as np
 
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import decode_integers, encode_integers
-from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, decode_step
+from hyrfpack.quant.steps import ALL_ZERO_CODE, FIXED_POINT_ONE, MAX_ABS_SYMBOL, decode_step
 
 ENTROPY_MODEL_COUNT = 8
-MAX_ABS_SYMBOL = 1 << 24
 _NUMBERS_PER_BLOCK = 1 << 15  # small enough that temporary arrays stay in the caches
 _HEADER_STRUCT = struct.Struct("<II")
 _LENGTH_STRUCT = struct.Struct("<I")

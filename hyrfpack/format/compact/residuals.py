@@ -15,10 +15,9 @@ from hyrfpack.format.compact.channels import BASIS_BYTES, read_basis
 from hyrfpack.format.sections import HARMONICS
 from hyrfpack.quant import DamagedDataError
 from hyrfpack.quant.integers import decode_integers, encode_integers
-from hyrfpack.quant.steps import FIXED_POINT_ONE, decode_step
+from hyrfpack.quant.steps import FIXED_POINT_ONE, MAX_ABS_SYMBOL, decode_step
 
 MAX_RESIDUAL_CLASSES = 16
-MAX_ABS_SYMBOL = 1 << 24
 _HEADER_STRUCT = struct.Struct("<BI")
 _LENGTH_STRUCT = struct.Struct("<I")
 
