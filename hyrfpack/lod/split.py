@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from hyrfpack.cameras.capture import MIN_COARSE_CAMERAS, Capture, place_photos
+from hyrfpack.cameras.capture import MIN_COARSE_CAMERAS, MISMATCH_REMEDY, Capture, place_photos
 from hyrfpack.cameras.files import camera_to_numbers
 from hyrfpack.cameras.view_sampling import resize_camera, sample_views
 from hyrfpack.checks import check_type, remove_control_characters
 from hyrfpack.config.split import MAX_TITLE_LENGTH, SplitConfig
 from hyrfpack.context import RunContext
-from hyrfpack.errors import HyrfError, HyrfFormatError
+from hyrfpack.errors import HyrfDataError, HyrfError, HyrfFormatError
 from hyrfpack.format.container import Container, read_container
 from hyrfpack.format.decode import decode_container
 from hyrfpack.format.info import describe_file
@@ -125,6 +125,7 @@ def split_model(
 
     Raises:
         HyrfError: the file cannot be read or holds no Gaussian, or the folder cannot be written or would be too large.
+        HyrfDataError: the photos do not belong to the model, or to the first one of a merged file.
         TypeError: `config` is not a SplitConfig, or `data` is not a Scene.
 
     Example:
@@ -145,9 +146,12 @@ def split_model(
     path, target = find_model(source), Path(target)
     shared_names = _name_shared_files(path)
     Outputs(path, scene=data, overwrite=True).folder(target, [MANIFEST_NAME, *shared_names])
+    facts = describe_file(path)
+    data = place_photos(facts, data)
+    if mismatch := Capture(facts, data).mismatch:
+        raise HyrfDataError(mismatch, fix=MISMATCH_REMEDY)
     with exclusive_folder(target), context.open_progress("split") as progress:
         Outputs(path, scene=data, overwrite=overwrite).folder(target, [MANIFEST_NAME, *shared_names])
-        data = place_photos(describe_file(path), data)
         files, manifest = _encode_scene(path, shared_names, name_model(source), config, data, progress)
         Outputs(path, scene=data, overwrite=overwrite).folder(target, files)
         _check_manifest(manifest, target / MANIFEST_NAME)

@@ -80,6 +80,13 @@ def test_python_refuses_to_edit_with_photos_of_another_frame(model, data_in_anot
         hyrfpack.edit_model(model, tmp_path / "x.hyrf", [MinOpacity(0.1)], data=photos)
 
 
+def test_python_refuses_to_split_with_photos_of_another_frame(model, data_in_another_frame, tmp_path):
+    photos = hyrfpack.load_scene(data_in_another_frame)
+    with pytest.raises(HyrfDataError, match="another coordinate frame"):
+        hyrfpack.split_model(model, tmp_path / "chunks", data=photos)
+    assert not (tmp_path / "chunks").exists()
+
+
 def test_photos_of_the_edited_part_of_a_merged_file_are_accepted_and_others_are_refused(
     model, data, data_in_another_frame, tmp_path
 ):

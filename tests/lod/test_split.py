@@ -278,7 +278,8 @@ def test_a_budget_that_shows_nothing_is_refused(folder, limit):
 
 
 def test_levels_are_fitted_and_measured_at_the_cameras_of_the_photos(tmp_path, monkeypatch):
-    scene, used = ball_scene(6), []
+    scene, used, source = ball_scene(6), [], tmp_path / "model.hyrf"
+    save_model(load_model(COMPACT_FILE), source)  # without the cameras of its own photos
 
     def record(levels, spheres, cameras, *rest):
         used.extend(cameras)
@@ -287,15 +288,15 @@ def test_levels_are_fitted_and_measured_at_the_cameras_of_the_photos(tmp_path, m
     monkeypatch.setattr(split, "measure_level_errors", record)
     monkeypatch.setattr(split, "MEASURED_VIEWS_PER_PART", 3)
     config = SplitConfig(chunk_gaussians=400, levels=2, refit_steps=1)
-    split_model(COMPACT_FILE, tmp_path / "scene", config, data=scene, context=QUIET_CONTEXT)
+    split_model(source, tmp_path / "scene", config, data=scene, context=QUIET_CONTEXT)
 
     photographed = [view.camera for view in scene.train]
     stored = SceneFolder(tmp_path / "scene").manifest.cameras
     assert [list(row) for row in stored] == [camera_to_numbers(camera) for camera in photographed]
     assert len(used) == 3 and {camera.fx for camera in used} == {photographed[0].fx}
-    assert photographed[0].fx not in {camera.fx for camera in Capture(describe_file(COMPACT_FILE)).cameras}
+    assert photographed[0].fx not in {camera.fx for camera in Capture(describe_file(source)).cameras}
     with pytest.raises(TypeError, match="data"):
-        split_model(COMPACT_FILE, tmp_path / "scene", config, data=photographed, context=QUIET_CONTEXT)
+        split_model(source, tmp_path / "scene", config, data=photographed, context=QUIET_CONTEXT)
 
 
 @pytest.mark.parametrize(
