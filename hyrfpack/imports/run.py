@@ -36,6 +36,8 @@ from hyrfpack.splats.splats import Splats
 
 _LOG = logging.getLogger(__name__)
 
+OUT_OF_MEMORY_FIX = "reduce `size`"
+
 
 @dataclass(frozen=True)
 class ImportReport:
@@ -76,7 +78,7 @@ class ImportReport:
         return asdict(self)
 
 
-@explain_out_of_memory("reduce `size`")
+@explain_out_of_memory(OUT_OF_MEMORY_FIX)
 def import_splats(
     source: str | os.PathLike[str],
     target: str | os.PathLike[str],
@@ -135,6 +137,7 @@ def check_target(
     Outputs(source, cameras, folder=folder, scene=scene, overwrite=overwrite).file(target, ".hyrf")
 
 
+@explain_out_of_memory(OUT_OF_MEMORY_FIX)
 def import_loaded_splats(
     splats: Splats,
     target: str | os.PathLike[str],
@@ -150,7 +153,7 @@ def import_loaded_splats(
     Without cameras, viewpoints are sampled (`sample_viewpoints`). The Gaussians that contribute least to the renders
     from there are left out. The fields are zero, and residuals hold the shapes and colours of the others
     (`exact_model`). On the CPU the same splats and settings give the same bytes; on a GPU sums of gradients vary in
-    their last bits.
+    their last bits. If the packed file cannot be scored, as when memory runs out, it is written without scores.
 
     Args:
         splats: the splats, in any units and at any place.
@@ -193,9 +196,14 @@ def import_loaded_splats(
         psnr, target_bytes = config.target_psnr, config.target_bytes
         data = pack(prepared, psnr, provenance, packing, worst=config.worst, target_bytes=target_bytes)
         progress(TaskEvent("scoring the file", 0.97))
-        decoded = decode_model(data, device)
-        decoded.precision = prepared.model.precision
-        scores = prepared.test.psnr_per_view(decoded)
+        try:
+            decoded = decode_model(data, device)
+            decoded.precision = prepared.model.precision
+            scores = prepared.test.psnr_per_view(decoded)
+        except Exception:  # not an interrupt, which keeps an earlier file
+            written = write_atomic(target, data, overwrite=overwrite)
+            _LOG.warning(f"{written}: the file is complete, but it could not be scored")
+            raise
         reached_psnr = float(np.mean(scores))
         if config.target_bytes is None:  # With a target size, there may be no space for it.
             data = _state_psnr(data, decoded.config, reached_psnr)

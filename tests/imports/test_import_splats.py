@@ -207,6 +207,34 @@ def test_an_interrupt_while_packing_keeps_the_old_file(tmp_path: Path, monkeypat
     assert target.read_bytes() == b"before"
 
 
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [(MemoryError("no room"), "memory ran out .*; reduce `size`"), (HyrfError("a bug", fix="x"), "a bug")],
+)
+def test_a_file_that_cannot_be_scored_is_kept(
+    error, raised: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(run, "decode_model", fail)
+    target = tmp_path / "x.hyrf"
+    with pytest.raises(HyrfError, match=raised):
+        import_loaded_splats(ball_splats(20), target, TINY_IMPORT_CONFIG)
+    assert len(hyrfpack.load_model(target)) > 0
+    assert f"{target}: the file is complete, but it could not be scored" in caplog.messages
+
+
+def test_no_negative_share_of_the_allowed_error_is_printed(caplog: pytest.LogCaptureFixture) -> None:
+    class FakePacker:
+        def encode(self, distortion: float, progress: object) -> pack.EncodedCandidate:
+            return pack.EncodedCandidate(b"data", {})
+
+    with caplog.at_level("INFO", "hyrfpack"):
+        pack._search(FakePacker(), 1e-4, lambda candidate: -0.3, lambda event: None)
+    assert caplog.messages and all(message.endswith(", 0.00 of the allowed error") for message in caplog.messages)
+
+
 def _interrupt_second_call(compress):
     calls = []
 
