@@ -299,6 +299,6 @@ def make_selection_mask(
         low, high = (corner.round(4).tolist() for corner in (positions.min(0), positions.max(0)))
         raise HyrfError(
             f"no Gaussian is left: centres lie between {low} and {high}, opacities reach {opacities.max():.3f}",
-            fix="widen `crop` or lower `min_opacity`",
+            fix="lower `min_opacity`" if crop is None else "move or widen `crop`, or lower `min_opacity`",
         )
     return keep

@@ -219,7 +219,7 @@ def _export_levels(
 def _check_cameras(loaded: Source, source: str | os.PathLike[str], data: Scene | None) -> None:
     """Raise HyrfError if no cameras are precise enough, or if they would not fit the photos on disk.
 
-    It warns if nobody knows which photo a camera belongs to.
+    It warns if nobody knows which photo a camera belongs to, and says how many photos are left out as held out.
     """
     if not loaded.cameras or loaded.has_coarse_cameras:
         stored_cameras = "only coarse cameras" if loaded.has_coarse_cameras else "no cameras"
@@ -242,6 +242,12 @@ def _check_cameras(loaded: Source, source: str | os.PathLike[str], data: Scene |
             "or turned upright as they are loaded, or cut from panoramas, so the model's cameras do not fit the files",
             fix="undistort the photos (COLMAP's image_undistorter) or save them upright (exiftran -a), and give that "
             "folder with `data`",
+        )
+    if data.test:
+        _LOG.info(
+            f"the cameras of {format_count(len(data.test), 'held-out photo')} are not written, only those of "
+            f"{format_count(len(data.train), 'training photo')}; `test_every=0` holds out none, unless the set itself "
+            "does"
         )
 
 

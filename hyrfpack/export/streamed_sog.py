@@ -11,6 +11,7 @@ Source: the PlayCanvas user manual, "The Streamed SOG Format", version 1 (develo
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
@@ -35,6 +36,7 @@ ENVIRONMENT_NAME = "env"
 FORMAT_VERSION = 1
 # A file is the unit that a program loads. A SOG has at most 16,384 rows of harmonics, one for 4 Gaussians up to here.
 MAX_FILE_GAUSSIANS = 65_536
+_MIN_BOX_DIAGONAL = 1e-30  # The logarithm of the diagonal of a box of one point would not be finite.
 
 
 @dataclass
@@ -143,7 +145,7 @@ def _make_tree(baked: BakedLevels, leaves: Sequence[_Leaf], level_count: int) ->
     chunks = baked.scene.manifest.chunks
 
     def describe(node: BoxTree) -> dict[str, Any]:
-        bound = {"min": _round_digits(node.box.low), "max": _round_digits(node.box.high)}
+        bound = _describe_bound(node.box)
         if node.leaf is None:
             return {"bound": bound, "children": [describe(child) for child in node.children]}
         ranges = sorted(leaves[node.leaf].ranges.items())
@@ -152,6 +154,16 @@ def _make_tree(baked: BakedLevels, leaves: Sequence[_Leaf], level_count: int) ->
         return {"bound": bound, "lods": lods, "errors": _round_digits(errors)}
 
     return describe(BoxTree.build([Box.around(leaf.boxes) for leaf in leaves]))
+
+
+def _describe_bound(box: Box) -> dict[str, list[float]]:
+    """Return the corners of a box, rounded to 7 digits of its diagonal.
+
+    The format asks for 7 digits. Those of the coordinates themselves would not tell the corners of a box apart that is
+    far from the origin.
+    """
+    decimals = 6 - math.floor(math.log10(max(box.diagonal, _MIN_BOX_DIAGONAL)))
+    return {name: np.round(corner, decimals).tolist() for name, corner in (("min", box.low), ("max", box.high))}
 
 
 def _round_digits(values: Sequence[float] | np.ndarray) -> list[float]:

@@ -74,7 +74,7 @@ def choose_grid(
         corners = " and ".join(str(corner.round(3).tolist()) for corner in (points.min(axis=0), points.max(axis=0)))
         raise HyrfError(
             f"no camera sees a surface in the box; the surfaces that they see lie between {corners}",
-            fix="widen `crop`",
+            fix="move or widen `crop`",
         )
     # A crop may be far larger than what is seen in it.
     low, high = np.maximum(low, points[inside].min(axis=0)), np.minimum(high, points[inside].max(axis=0))

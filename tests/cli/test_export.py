@@ -130,6 +130,18 @@ def test_cameras_and_points_are_counted(model, tmp_path):
     assert succeeded("export", model, "-o", tmp_path / "colmap", "--colmap").stdout.endswith(" bytes, 4 cameras\n")
 
 
+def test_a_note_says_that_held_out_cameras_are_not_written(data, tmp_path):
+    scene = load_scene(data)
+    model = tmp_path / "model.hyrf"
+    save_model(small_model(GAUSSIAN_POSITIONS), model, provenance=scene_provenance(scene))
+    result = succeeded("export", model, "-o", tmp_path / "a.json", "--data", data)
+    written = len(json.loads((tmp_path / "a.json").read_text())["frames"])
+    assert (written, len(scene.test)) == (len(scene.train), 2)
+    assert f"the cameras of 2 held-out photos are not written, only those of {written} training photos" in result.stderr
+    every = succeeded("export", model, "-o", tmp_path / "b.json", "--data", data, "--test-every", 0)
+    assert "held-out" not in every.stderr
+
+
 def test_one_thing_is_named_in_the_singular(tmp_path):
     kept = {"cameras": provenance_cameras(ring(1))}
     save_model(small_model(GAUSSIAN_POSITIONS[:1]), tmp_path / "one.hyrf", provenance=kept)
@@ -198,8 +210,8 @@ WRONG_REQUESTS = {
     "few numbers": (("-o", "a.ply", "--crop", "0,0,0,1"), "is not a box"),
     "words": (("-o", "a.ply", "--crop", "a,b,c,d,e,f"), "is not a box"),
     "inside out": (("-o", "a.ply", "--crop", "1,0,0,0,1,1"), "a minimum above its maximum"),
-    "nothing inside": (("-o", "a.ply", "--crop", "7,7,7,8,8,8"), "no Gaussian is left"),
-    "too faint": (("-o", "a.ply", "--min-opacity", "1"), "no Gaussian is left"),
+    "nothing inside": (("-o", "a.ply", "--crop", "7,7,7,8,8,8"), "; move or widen --crop, or lower --min-opacity"),
+    "too faint": (("-o", "a.ply", "--min-opacity", "1"), "; lower --min-opacity"),
     "opacity": (("-o", "a.ply", "--min-opacity", "2"), "'--min-opacity'"),
     "NaN opacity": (("-o", "a.ply", "--min-opacity", "nan"), "nan is not allowed"),
     "crop of cameras": (("-o", "a.json", "--crop", "0,0,0,1,1,1"), "only cameras"),

@@ -13,6 +13,7 @@ import hyrfpack
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.export import streamed_sog
+from hyrfpack.export.boxes import Box
 from hyrfpack.format.scene_folder import SceneFolder
 from hyrfpack.format.scene_manifest import Chunk, ChunkLevel
 from hyrfpack.lock import exclusive_folder
@@ -232,6 +233,14 @@ def test_a_chunk_may_have_fewer_levels_than_others(scene, tmp_path):
     index = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     assert sorted(len(leaf["lods"]) for leaf in leaves(index)) == [1, 3, 3, 3]
     assert report.level_gaussians == [256, 48, 12] and "environment" not in index
+
+
+@pytest.mark.parametrize("offset", [0.0, 4_567_890.0])
+def test_bounds_have_7_digits_of_their_size_wherever_they_lie(offset):
+    low, high = np.array([0.1, 0.2, 0.3]) + offset, np.array([1.123456789, 0.7, 0.9]) + offset
+    bound = streamed_sog._describe_bound(Box(low, high))
+    np.testing.assert_allclose(bound["min"], low, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(bound["max"], high, rtol=0, atol=1e-6)
 
 
 def test_a_model_without_levels_is_refused_with_the_command_that_makes_them(scene, tmp_path):

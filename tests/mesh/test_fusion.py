@@ -150,7 +150,7 @@ def test_the_default_box_holds_what_cameras_see_near_the_centre():
 
 
 def test_a_box_without_a_surface_is_refused():
-    with pytest.raises(HyrfError, match=r"no camera sees a surface in the box; .* widen `crop`"):
+    with pytest.raises(HyrfError, match=r"no camera sees a surface in the box; .* move or widen `crop`"):
         choose_grid([sphere_map((4, 0, 0))], np.zeros(3), (5, 5, 5, 6, 6, 6), None)
 
 
