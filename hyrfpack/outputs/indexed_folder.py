@@ -15,9 +15,9 @@ class IndexedFolder:
     """A folder whose files are being written, of which the caller writes the index last. Files with other names stay.
 
     As a context, it keeps new files in a temporary folder and moves them to their places at the end, in the order in
-    which they were written. If anything fails before, the folder is as it was. An old index is removed only when all
-    files are written, just before the first is moved, so that it cannot name a mixture of old and new files. If a move
-    fails, the files that did not exist before are removed, so that the same call can be repeated.
+    which they were written. If anything fails, also a move, the folder is as it was. An old index is set aside only
+    when all files are written, just before the first is moved, so that it cannot name a mixture of old and new files
+    if the process is killed.
 
     Files refer to each other by name, so a name that is taken causes an error instead of another name.
 
@@ -81,22 +81,35 @@ class IndexedFolder:
         Raises:
             HyrfError: a file cannot be moved, or it exists and may not be replaced.
         """
-        new, folders = [], {(self.path / name).parent for name in self._names} - {self.path}
-        if self.overwrite:
-            with naming_failed_write(self.path / self.index_name), suppress(FileNotFoundError):
-                os.unlink(os.path.realpath(self.path / self.index_name))
+        folders = {(self.path / name).parent for name in self._names} - {self.path}
+        moved: list[Path] = []
+        old_files: list[tuple[str, Path]] = []  # where each old file was, and where it is kept meanwhile
+        with naming_failed_write(self.path / self.index_name):
+            kept = self._resources.enter_context(temporary_folder(self.path))
+
+        def set_aside(path: Path) -> None:
+            if self.overwrite and path.is_file():
+                old_files.append((os.path.realpath(path), kept / str(len(old_files))))
+                shutil.move(*old_files[-1])
+
         try:
+            with naming_failed_write(self.path / self.index_name):
+                set_aside(self.path / self.index_name)
             for name in self._names:
                 path, source = self.path / name, self._temporary / name
-                is_new = not path.exists()
                 length = source.stat().st_size
+                with naming_failed_write(path, length):
+                    set_aside(path)
                 with pending_file(path, length, overwrite=self.overwrite, rename=False) as pending:
                     shutil.move(source, pending.temporary)
-                new += [path] * is_new
+                moved.append(path)
         except BaseException:
-            for path in new:
+            for path in moved:
                 with suppress(OSError):
-                    path.unlink()
+                    os.unlink(os.path.realpath(path))
+            for original, temporary in reversed(old_files):
+                with suppress(OSError):
+                    shutil.move(temporary, original)
             for folder in folders:
                 with suppress(OSError):  # it holds other files, or was not created
                     folder.rmdir()

@@ -53,22 +53,23 @@ def test_an_error_before_the_end_leaves_the_folder_as_it_was(tmp_path, error):
     assert read_files(tmp_path) == old and sorted(os.listdir(tmp_path)) == ["a", "index"]
 
 
-def test_a_failed_move_leaves_no_index_and_no_new_file(tmp_path, monkeypatch):
-    write_old(tmp_path)
+@pytest.mark.parametrize("failing", ["a/1", "b/2", "index"])
+def test_a_failed_move_leaves_the_folder_as_it_was(failing, tmp_path, monkeypatch):
+    old = write_old(tmp_path)
     replace = os.replace
 
-    def fail_at_the_index(source, target):
-        if Path(target).name == "index":
+    def fail(source, target):
+        if Path(target) == tmp_path / failing:
             raise OSError(5, "Input/output error")
         replace(source, target)
 
-    monkeypatch.setattr("hyrfpack.atomic.os.replace", fail_at_the_index)
-    with pytest.raises(HyrfError, match="index: the file cannot be written"):
+    monkeypatch.setattr("hyrfpack.atomic.os.replace", fail)
+    with pytest.raises(HyrfError, match=f"{failing}: the file cannot be written"):
         with IndexedFolder(tmp_path, "index", overwrite=True) as output:
             for name in ("a/1", "b/2", "index"):
                 output.write(name, b"new")
 
-    assert read_files(tmp_path) == {"a/1": b"new"} and os.listdir(tmp_path) == ["a"]
+    assert read_files(tmp_path) == old and sorted(os.listdir(tmp_path)) == ["a", "index"]
 
 
 def test_without_overwrite_an_existing_file_is_kept_and_nothing_new_stays(tmp_path):
