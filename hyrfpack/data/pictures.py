@@ -35,9 +35,9 @@ _HEIC_EXTENSIONS = (".heic", ".heif", ".hif")
 _HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
 # A JPEG is decoded at this ratio of the requested size or more. The PSNR to a full decode is then at least 49 dB.
 _MIN_DRAFT_SIZE_RATIO = 2
-# Lossy compression raises black pixels near an edge: by up to 13 levels in JPEG masks of quality 90, and of quality 75
-# by at least this many levels in less than 1 % of the black pixels.
-_MIN_USABLE_LEVEL_IN_LOSSY_MASKS = 16
+# Lossy compression raises black pixels near an edge: by up to 13 levels in JPEG masks of quality 90, and of quality 50
+# by at least this many levels in less than 0.5 % of the black pixels. It lowers no white pixel below 96.
+_MIN_USABLE_LEVEL_IN_LOSSY_MASKS = 64
 # Phones take photos of 200 million pixels. A picture takes 3 bytes a pixel where it is not decoded at a reduced size.
 MAX_PICTURE_PIXELS = 500_000_000
 
@@ -301,7 +301,7 @@ def read_pixels(
 def read_mask(path: Path, height: int, width: int, *, require_all: bool = False, orientation: int = 1) -> np.ndarray:
     """Decode a mask, in which black marks a pixel to ignore, and resize it.
 
-    Black is level 0, and in JPEG and lossy WebP files every level below 16. If all pixels of the mask have one colour
+    Black is level 0, and in JPEG and lossy WebP files every level below 64. If all pixels of the mask have one colour
     other than black, and their alpha differs, the alpha is the mask.
 
     Args:

@@ -108,10 +108,11 @@ def test_a_mask_that_fits_its_photo_in_no_orientation_is_refused(tmp_path):
     ("name", "options"),
     [
         ("m.jpg", {"quality": 90}),
+        ("m.jpg", {"quality": 75}),
         ("m.webp", {"quality": 90}),
         ("m.webp", {"quality": 90, "exif": b"Exif\0\0MM\0*\0\0\0\x08\0\0\0\0\0\0"}),  # in an extended container
     ],
-    ids=["JPEG", "WebP", "WebP with EXIF"],
+    ids=["JPEG", "JPEG of quality 75", "WebP", "WebP with EXIF"],
 )
 def test_pixels_that_lossy_compression_raises_from_black_stay_ignored(tmp_path, name, options):
     y, x = np.mgrid[:200, :200]
@@ -121,6 +122,16 @@ def test_pixels_that_lossy_compression_raises_from_black_stay_ignored(tmp_path, 
         assert (np.asarray(image.convert("L"))[~usable] > 0).sum() > 500  # the fault that compression makes
 
     np.testing.assert_array_equal(read_mask(tmp_path / name, 200, 200), usable)
+
+
+def test_few_black_pixels_of_a_jpeg_of_quality_50_are_kept_and_no_white_one_is_lost(tmp_path):
+    y, x = np.mgrid[:200, :200]
+    usable = (y - 100) ** 2 + (x - 100) ** 2 >= 60**2
+    Image.fromarray(usable.astype(np.uint8) * 255).save(tmp_path / "m.jpg", quality=50)
+
+    found = read_mask(tmp_path / "m.jpg", 200, 200)
+
+    assert found[usable].all() and found[~usable].mean() < 0.005
 
 
 @pytest.mark.parametrize("name", ["m.png", "m.webp"])
