@@ -30,7 +30,7 @@ def test_golden_file_decodes_to_the_recorded_numbers(file):
 
     decoded = {name: value.numpy() for name, value in load_model(file).state_dict().items()}
 
-    assert sorted(decoded) == sorted(name for name in recorded.files if not name.startswith("exposure."))
+    assert sorted(decoded) == sorted(name for name in recorded.files if not name.startswith(("exposure.", "sampling.")))
     for name, values in decoded.items():
         # Bits are compared, so that -0.0 differs from 0.0 and denormals count.
         assert np.array_equal(values.view(np.uint32), recorded[name].view(np.uint32)), name
@@ -96,6 +96,15 @@ def test_golden_file_with_an_exposure_map_renders_the_recorded_picture(name):
         np.abs(render_view(model, camera, RenderSettings(exposure=CONSISTENT_EXPOSURE)).rgb.numpy() - recorded).max()
         > 0.02
     )
+
+
+def test_a_golden_file_with_cameras_and_their_rate_ratio_gives_the_recorded_pixel_sizes():
+    recorded = np.load(GOLDEN_FOLDER / "v1.1_compact_sampling.npz")["sampling.pixel_sizes"]
+
+    sizes = load_model(GOLDEN_FOLDER / "v1.1_compact_sampling.hyrf").gaussians.pixel_sizes.numpy()
+
+    np.testing.assert_allclose(sizes, recorded, rtol=1e-5)
+    assert len(np.unique(recorded)) == len(recorded)
 
 
 def test_the_rotated_golden_file_renders_the_picture_of_the_straight_one_from_the_rotated_camera():

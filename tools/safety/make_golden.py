@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import io
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.atomic import write_atomic
+from hyrfpack.cameras.files import camera_from_numbers, camera_to_numbers
 from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.config.split import SplitConfig
 from hyrfpack.format import decode_model
@@ -57,20 +58,44 @@ GOLDEN_ROTATION = (0.5, -0.1, 0.7, 0.5)
 
 @dataclass(frozen=True)
 class GoldenFile:
-    """How a golden file is encoded: profile, settings of the profile, exposure map, rotation, and residuals."""
+    """How a golden file is encoded: profile and its settings, exposure map, rotation, residuals, and provenance."""
 
     profile: str
     settings: dict[str, Any]
     exposure: ExposureMap | None = None
     rotation: Quaternion = IDENTITY
     residual_degree: int | None = None
+    provenance: dict[str, Any] = field(default_factory=lambda: GOLDEN_PROVENANCE)
 
 
+GOLDEN_CAMERA_CENTERS = ((0.1, 0.2, 1.0), (-1.5, 0.0, 2.5))  # the scene's centre in each camera, in local units
+GOLDEN_FRAME_CENTER, GOLDEN_FRAME_SCALE = (1e6, -0.1, 3.0), 12.5
+
+
+def make_camera_at(center: tuple[float, float, float], rotation: Quaternion = IDENTITY) -> Camera:
+    """Return a camera in which the centre of the golden model is at `center`, in local units.
+
+    In local units, the camera is the same for all rotations of the frame.
+    """
+    w, x, y, z = rotation
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix().T
+    pose[:3, 3] = GOLDEN_FRAME_SCALE * np.array(center) - pose[:3, :3] @ GOLDEN_FRAME_CENTER
+    return Camera(16, 12, 20.0, 20.0, 8.0, 6.0, pose)
+
+
+GOLDEN_SAMPLING = {
+    "coarse_cameras": [camera_to_numbers(make_camera_at(center)) for center in GOLDEN_CAMERA_CENTERS],
+    "rate_ratio": 1.75,
+}
 GOLDEN_FILES = {
     "v1.0_raw": GoldenFile("raw", {}),
     "v1.0_paper": GoldenFile("paper", {"color": (3, 8), "scale": (2, 4), "opacity": (1, 16)}),
     "v1.1_compact": GoldenFile("compact", {"distortion": 5e-4}),
     "v1.1_compact_layers": GoldenFile("compact", {"distortion": 1e-5, "layered": True}),
+    "v1.1_compact_sampling": GoldenFile(
+        "compact", {"distortion": 5e-4}, provenance={**GOLDEN_PROVENANCE, **GOLDEN_SAMPLING}
+    ),
     "v1.2_compact_exposure": GoldenFile("compact", {"distortion": 5e-4}, GOLDEN_EXPOSURE_MAP),
     "v1.3_compact_rotated": GoldenFile("compact", {"distortion": 5e-4}, GOLDEN_EXPOSURE_MAP, GOLDEN_ROTATION),
     "v1.6_compact_residuals": GoldenFile("compact", {"distortion": 1e-5, "layered": True}, residual_degree=2),
@@ -90,7 +115,7 @@ def make_golden_model(rotation: Quaternion = IDENTITY) -> HybridModel:
     """Return a model of 20 Gaussians with one dense and one hashed level in each grid, and no two equal sizes."""
     rng = np.random.default_rng(20)
     config = ModelConfig(
-        frame=Frame(center=(1e6, -0.1, 3.0), scale=12.5, half_extent=(1.0, 0.75, 0.25), rotation=rotation),
+        frame=Frame(GOLDEN_FRAME_CENTER, GOLDEN_FRAME_SCALE, (1.0, 0.75, 0.25), rotation),
         geometry=HashGridConfig(log2_table_size=4, levels=2, base=2, finest=5),
         radiance=HashGridConfig(log2_table_size=5, levels=2, base=3, finest=7),
         hidden=3,
@@ -156,16 +181,8 @@ def expect_values(model: HybridModel, profile: str, data: bytes) -> dict[str, np
 
 
 def make_golden_camera(rotation: Quaternion = IDENTITY) -> Camera:
-    """Return a camera that sees the golden model from inside the box of the exposure map.
-
-    In local units, the camera is the same for all rotations of the frame.
-    """
-    frame = make_golden_model(rotation).config.frame
-    w, x, y, z = rotation
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix().T
-    pose[:3, 3] = frame.scale * np.array([0.1, 0.2, 1.0]) - pose[:3, :3] @ frame.center
-    return Camera(16, 12, 20.0, 20.0, 8.0, 6.0, pose)
+    """Return a camera that sees the golden model from inside the box of the exposure map."""
+    return make_camera_at(GOLDEN_CAMERA_CENTERS[0], rotation)
 
 
 def expect_exposure(exposure: minimal_reader.Exposure, model: HybridModel) -> dict[str, np.ndarray]:
@@ -193,6 +210,24 @@ def expect_exposure(exposure: minimal_reader.Exposure, model: HybridModel) -> di
     }
 
 
+def expect_pixel_sizes(provenance: dict[str, Any], positions: np.ndarray) -> np.ndarray:
+    """Return the pixel sizes (N,) at local positions (N, 3) by the equations of the format, for straight frames.
+
+    The cameras look along the axes of the frame.
+    """
+    rates, rates_by_distance = [], []
+    for camera in map(camera_from_numbers, provenance["coarse_cameras"]):
+        center = (camera.camera_from_world[:3, :3] @ GOLDEN_FRAME_CENTER + camera.camera_from_world[:3, 3]).round(6)
+        x, y, z = (positions.astype(np.float64) + center / GOLDEN_FRAME_SCALE).T
+        with np.errstate(divide="ignore"):
+            column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside = (np.abs(column / camera.width - 0.5) <= 0.65) & (np.abs(row / camera.height - 0.5) <= 0.65)
+        rates.append(np.where((z > 0.01) & inside, camera.fx / z, 0))
+        rates_by_distance.append(camera.fx / np.maximum(np.sqrt(x**2 + y**2 + z**2), 0.01))
+    seen = np.max(rates, axis=0)
+    return 1 / np.where(seen > 0, seen, np.max(rates_by_distance, axis=0)) / provenance["rate_ratio"]
+
+
 def encode_golden_parts() -> bytes:
     """Return the bytes of the merged file."""
     return encode_parts([(name, (GOLDEN_FOLDER / f"{file}.hyrf").read_bytes()) for name, file in GOLDEN_PARTS.items()])
@@ -218,8 +253,11 @@ def main() -> None:
         model.exposure = golden.exposure
         if golden.residual_degree is not None:
             model = add_golden_residuals(model, golden.residual_degree)
-        data = encode(model, golden.profile, GOLDEN_PROVENANCE, **golden.settings)
-        write_golden_file(target, data, expect_values(model, golden.profile, data))
+        data = encode(model, golden.profile, golden.provenance, **golden.settings)
+        values = expect_values(model, golden.profile, data)
+        if "rate_ratio" in golden.provenance:
+            values["sampling.pixel_sizes"] = expect_pixel_sizes(golden.provenance, values["gaussians.positions"])
+        write_golden_file(target, data, values)
         print(f"{target}: {len(data)} bytes")
     if GOLDEN_MERGED_FILE.exists():
         print(f"{GOLDEN_MERGED_FILE} exists and is kept")
