@@ -83,14 +83,15 @@ def scene_frame(scene: Scene, preset: str) -> Frame:
 def budget_for(scene: Scene, config: TrainConfig, header_bytes: int | None = None) -> tuple[int, str]:
     """Return the Gaussian budget of a run and the reason in words.
 
-    The usual budget (`usual_budget`) is multiplied by `config.budget_factor`. For a target size, the budget is the
+    The usual budget (`usual_budget`) takes `config.budget_factor` into account. For a target size, the budget is the
     number of Gaussians that fit beside `header_bytes` of decoders and headers (None for those of one model), at most
     `MAX_TARGETED_BUDGET_RATIO` times the usual budget.
     """
     if config.max_gaussians is not None:
         return config.max_gaussians, "asked for"
     budget = usual_budget_for(scene, config.steps)
-    why = f"{count_pixels(scene):,} pixels in all, {config.steps:,} steps"
+    pixels = f"{count_pixels(scene):,} pixels in all"
+    why = f"{pixels}, {config.steps:,} steps"
     if config.target_bytes is not None:
         if header_bytes is None:
             header_bytes = PACKED_NARROW_HEADER_BYTES if has_narrow_decoders(config) else PACKED_HEADER_BYTES
@@ -98,9 +99,12 @@ def budget_for(scene: Scene, config: TrainConfig, header_bytes: int | None = Non
         if fitting <= MAX_TARGETED_BUDGET_RATIO * budget:
             return fitting, f"to be packed into {config.target_bytes:,} bytes"
         return MAX_TARGETED_BUDGET_RATIO * budget, f"{MAX_TARGETED_BUDGET_RATIO} times what suits {why}"
-    if config.budget_factor not in (None, 1):
-        return max(1, round(config.budget_factor * budget)), f"{config.budget_factor:g} times what suits {why}"
-    return budget, why
+    if config.budget_factor in (None, 1):
+        return budget, why
+    corrected = usual_budget_for(scene, config.steps, config.budget_factor)
+    if corrected == budget:
+        return budget, f"the limit for {config.steps:,} steps, below {config.budget_factor:g} times what suits {pixels}"
+    return corrected, f"{config.budget_factor:g} times what suits {why}"
 
 
 def has_narrow_decoders(config: TrainConfig) -> bool:
@@ -122,13 +126,13 @@ def count_pixels(scene: Scene) -> int:
     return sum(view.camera.width * view.camera.height for view in scene.train)
 
 
-def usual_budget_for(scene: Scene, steps: int) -> int:
-    """Return the Gaussian budget that a scene's training photos and the length of a run suggest."""
+def usual_budget_for(scene: Scene, steps: int, factor: float = 1.0) -> int:
+    """Return the Gaussian budget that a scene's training photos and the length of a run suggest, see `usual_budget`."""
     pixels = count_pixels(scene)
-    return usual_budget(pixels / len(scene.train), pixels, steps)
+    return usual_budget(pixels / len(scene.train), pixels, steps, factor)
 
 
-def usual_budget(photo_pixels: float, all_pixels: float, steps: int) -> int:
+def usual_budget(photo_pixels: float, all_pixels: float, steps: int, factor: float = 1.0) -> int:
     """Return the Gaussian budget that photos and the length of a run suggest.
 
     It grows with the photos' pixels and with the square root of the run's length, because a shorter run can fit fewer
@@ -138,10 +142,13 @@ def usual_budget(photo_pixels: float, all_pixels: float, steps: int) -> int:
         photo_pixels: mean number of pixels of a training photo.
         all_pixels: number of pixels of all training photos.
         steps: number of optimiser steps.
+        factor: multiplies what the pixels suggest. Above 1, it raises the limit by steps, too; below 1, it does not
+            lower that limit, which may be far below what the scene is worth.
     """
     full = max(GAUSSIANS_PER_PIXEL_OF_ONE_PHOTO * photo_pixels, GAUSSIANS_PER_PIXEL_OF_ALL_PHOTOS * all_pixels)
     length = math.sqrt(min(1.0, steps / FULL_STEPS))
-    return max(MIN_BUDGET, min(round(full * length), MAX_GAUSSIANS_PER_STEP * steps))
+    suggested, limit = (max(MIN_BUDGET, count) for count in (round(full * length), MAX_GAUSSIANS_PER_STEP * steps))
+    return max(1, min(round(factor * suggested), round(max(1.0, factor) * limit)))
 
 
 def check_target(scene: Scene, config: TrainConfig) -> None:

@@ -216,6 +216,16 @@ def test_a_budget_factor_multiplies_the_budget_by_pixels_and_steps(factor):
 
 
 @pytest.mark.parametrize(
+    ("factor", "expected"), [(0.1, 0.1 * 0.85 * 1600**2 / 15**0.5), (0.7, 100_000), (1.0, 100_000), (1.5, 150_000)]
+)
+def test_a_small_factor_lowers_only_what_the_pixels_suggest_and_not_the_limit_by_steps(factor, expected):
+    scene = make_rig_scene(ring(60, width=1600, height=1600))
+    budget, why = budget_for(scene, TrainConfig(steps=2000, budget_factor=factor))
+    assert budget == round(expected)
+    assert why.startswith("the limit for 2,000 steps, below 0.7 times") == (factor == 0.7)
+
+
+@pytest.mark.parametrize(
     "target, header",
     [
         (15_000, PACKED_NARROW_HEADER_BYTES),
