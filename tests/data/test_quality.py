@@ -77,7 +77,7 @@ def test_arrays_that_are_no_picture_are_rejected():
         mark_blurred([1.0, np.inf])
 
 
-def test_a_photo_mark_blurred_relative_to_its_neighbours_to_the_set_or_absolutely():
+def test_a_photo_is_blurred_relative_to_its_neighbours_to_the_set_or_absolutely():
     beside = [1.0] * 9 + [0.62] + [1.0] * 9
     assert np.flatnonzero(mark_blurred(beside)).tolist() == [9]
     run = [1.0] * 20 + [0.5] * 9 + [1.0] * 20  # the middle one has only blurred neighbours
