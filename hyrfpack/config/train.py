@@ -139,7 +139,8 @@ class TrainConfig:
         seed: random seed. On a CPU, the same seed gives the same file.
         preset: kind of scene; auto detects it.
         max_gaussians: budget: the number of Gaussians in the end, at most. Default: measured by pilot runs.
-        budget_factor: the budget as a multiple of what pixels and steps suggest. Default: measured by pilot runs.
+        budget_factor: multiplies the budget that the pixels suggest; below 1, it does not lower the limit for short
+            runs. Default: measured by pilot runs.
         target_bytes: choose the budget so that 'hyrfpack compress' reaches this file size, such as 500kB.
         surface_points: start with points on surfaces that photos show, beside those of the scene, up to the budget.
         log2_table_size: rows per level of the hash grid: 2^B.

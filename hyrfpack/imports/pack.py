@@ -125,11 +125,9 @@ def _search(
         trial_progress = round_of_progress(progress, number)
         candidate = packer.encode(distortion, part_of_progress(trial_progress, 0.0, 0.5))
         trial_progress(TaskEvent("comparing renders of the file with those of the original", 0.5))
-        ratio = error_ratio(candidate)
-        _LOG.info(
-            f"distortion {distortion:.2g}: {len(candidate.data):,} bytes, {max(0.0, ratio):.2f} of the allowed error"
-        )
-        trials.append((distortion, max(ratio, MIN_ERROR_RATIO), candidate))
+        ratio = max(error_ratio(candidate), MIN_ERROR_RATIO)
+        _LOG.info(f"distortion {distortion:.2g}: {len(candidate.data):,} bytes, {ratio:.2f} of the allowed error")
+        trials.append((distortion, ratio, candidate))
         if ACCEPTED_ERROR_RATIO <= ratio <= 1:
             break
         distortion = _next_distortion([(d, r) for d, r, _ in trials[-2:]])

@@ -89,8 +89,8 @@ class SceneCost:
         density = DensityConfig()
         step = self.step_seconds + self.step_seconds_per_gaussian * density.mean_count(budget, budget)
         step *= PhotoSize.of_views(scene.train).mean_step_cost(density, budget, budget)
-        waiting = self.decoding_seconds * min(steps, len(scene.train)) + estimate_depth_map_seconds(len(scene.train))
-        return TRAINED_PACE_RATIO * steps * step + waiting
+        decoding = self.decoding_seconds * min(steps, len(scene.train))
+        return TRAINED_PACE_RATIO * steps * step + decoding + estimate_depth_map_seconds(len(scene.train))
 
     def seconds_after_training(self, scene: Scene, steps: int) -> dict[str, float]:
         """Estimate the seconds of the work after the last training step, by part of a stage, see `STAGE_PARTS`."""

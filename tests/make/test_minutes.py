@@ -53,9 +53,9 @@ def test_steps_are_limited_to_a_full_run(scene):
 
 def test_step_time_grows_with_the_number_of_pixels(scene):
     four = MEASURED_COST.scaled_by_pixels(4.0)
-    waiting = MEASURED_COST.decoding_seconds * len(scene.train) + estimate_depth_map_seconds(len(scene.train))
+    other_seconds = MEASURED_COST.decoding_seconds * len(scene.train) + estimate_depth_map_seconds(len(scene.train))
     assert four.training_seconds(scene, 1000) - MEASURED_COST.training_seconds(scene, 1000) == pytest.approx(
-        3 * (MEASURED_COST.training_seconds(scene, 1000) - waiting)
+        3 * (MEASURED_COST.training_seconds(scene, 1000) - other_seconds)
     )
 
 
