@@ -142,7 +142,8 @@ def test_the_search_returns_the_largest_fitting_trial(limit, slope, jump, start)
         assert answer == (min(fitting),) * 2
     else:
         assert answer == (DISTORTION_RANGE[1], recorded.made[-1])
-        assert [noise for noise in recorded.made if noise > 0.99 * DISTORTION_RANGE[1]] == recorded.made[-1:]
+        largest = (1 - 1e-9) * DISTORTION_RANGE[1]  # up to rounding; another trial may come close to it
+        assert [noise for noise in recorded.made if noise > largest] == recorded.made[-1:]
 
 
 def test_a_jump_in_the_sizes_ends_the_search():
