@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 
@@ -25,8 +25,7 @@ from hyrfpack.format.sections import (
 from hyrfpack.model import Geometry, HybridModel, expand
 from hyrfpack.model.field import Field
 from hyrfpack.model.gaussians import Gaussians
-from hyrfpack.parallel.pool import map_row_blocks, parallel_map, torch_on_one_thread
-from hyrfpack.parallel.threads import thread_count
+from hyrfpack.parallel.pool import iterate_results, map_row_blocks, torch_on_one_thread
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import render_view
 from hyrfpack.render.in_view import gaussians_in_view
@@ -156,30 +155,30 @@ def measure_sensitivity(
     required = {name: parameter.requires_grad for name, parameter in model.named_parameters()}
     pixels, field_pixels, is_window = 0, 0, windows.columns * windows.rows > 1
 
+    def iterate_jobs() -> Iterator[tuple[Camera, torch.Tensor, tuple[Field, Field] | None]]:
+        nonlocal pixels, field_pixels
+        for number, camera in enumerate(views):
+            progress(TaskEvent(f"measuring sensitivities, view {number + 1}/{len(views)}", number / len(views)))
+            signs = draw_signs(positions.new_empty(camera.height, camera.width, 3), generator)
+            # Views at and between cameras alternate, so both kinds are among the views of the fields.
+            with_fields = number % (2 * field_interval) < 2
+            pixels += signs.numel()
+            field_pixels += signs.numel() * with_fields
+            yield camera, signs, None if with_fields else frozen_fields
+
     def measure(job: tuple[Camera, torch.Tensor, tuple[Field, Field] | None]):
         return _square_gradients(model, *job, is_window=is_window, jacobian=jacobian)
 
-    # Each thread measures a whole view, and sums are made in the order of views.
-    views_at_once = thread_count() if positions.device.type == "cpu" else 1
     try:
         for values in (*model.parameters(), *_residuals(model).values()):
             values.requires_grad_(True)
-        for first in range(0, len(views), views_at_once):
-            jobs = []
-            for number, camera in enumerate(views[first : first + views_at_once], first):
-                progress(TaskEvent(f"measuring sensitivities, view {number + 1}/{len(views)}", number / len(views)))
-                signs = draw_signs(positions.new_empty(camera.height, camera.width, 3), generator)
-                # Views at and between cameras alternate, so both kinds are among the views of the fields.
-                with_fields = number % (2 * field_interval) < 2
-                pixels += signs.numel()
-                field_pixels += signs.numel() * with_fields
-                jobs.append((camera, signs, None if with_fields else frozen_fields))
-            for index, added in parallel_map(measure, jobs, positions.device):
-                for name, values in added.items():
-                    if name.startswith("gaussians."):
-                        squares[name][index] += values
-                    else:
-                        squares[name] += values
+        # Each thread measures a whole view, and sums are made in the order of views.
+        for index, added in iterate_results(measure, iterate_jobs(), positions.device):
+            for name, values in added.items():
+                if name.startswith("gaussians."):
+                    squares[name][index] += values
+                else:
+                    squares[name] += values
     finally:
         for name, parameter in model.named_parameters():
             parameter.requires_grad_(required[name])

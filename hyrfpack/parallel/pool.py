@@ -9,8 +9,9 @@ from __future__ import annotations
 import ctypes
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache
 from typing import TypeVar
@@ -196,6 +197,44 @@ def parallel_map(
 
     run_tasks(run, len(items))
     return [results[index] for index in range(len(items))]
+
+
+def iterate_results(
+    function: Callable[[S], T],
+    items: Iterable[S],
+    device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
+) -> Iterator[T]:
+    """Yield the results of a function in the order of the items, while the pool's threads compute the next ones.
+
+    Unlike `parallel_map` it holds few items and results at a time: up to twice as many as the pool has threads. A
+    thread that has finished an item does not wait for the others. After an error, or if the iterator is closed early,
+    no further call is started, and those that have begun are waited for.
+
+    Args:
+        function: called once for each item, on any of the threads.
+        items: arguments of the calls, taken from the iterable in the thread of the caller.
+        device: as `parallel_map` takes it.
+
+    Example:
+        >>> list(iterate_results(abs, [-2, 3]))
+        [2, 3]
+    """
+    threads = thread_count()
+    if device.type != "cpu" or threads == 1 or getattr(_thread_state, "is_worker", False):
+        yield from map(function, items)
+        return
+    calls: deque[Future[T]] = deque()
+    try:
+        for item in items:
+            if len(calls) == 2 * threads:
+                yield calls.popleft().result()
+            calls.append(_executor(threads).submit(function, item))
+        while calls:
+            yield calls.popleft().result()
+    finally:
+        for call in calls:
+            call.cancel()
+        wait(calls)
 
 
 def map_row_blocks(function: Callable[[slice], torch.Tensor], rows: int, device: torch.device) -> torch.Tensor:

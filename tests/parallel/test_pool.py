@@ -7,13 +7,21 @@ import platform
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from concurrent.futures import Future
 
 import pytest
 import torch
 
 from hyrfpack.parallel import pool
-from hyrfpack.parallel.pool import ROWS_PER_BLOCK, map_row_blocks, parallel_map, run_jobs, run_tasks
+from hyrfpack.parallel.pool import (
+    ROWS_PER_BLOCK,
+    iterate_results,
+    map_row_blocks,
+    parallel_map,
+    run_jobs,
+    run_tasks,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -25,6 +33,61 @@ def test_results_have_the_order_of_the_items_and_the_names_of_the_jobs() -> None
     assert parallel_map(lambda number: number**2, list(range(50))) == [number**2 for number in range(50)]
     assert run_jobs({name: name.upper for name in "cab"}) == {"c": "C", "a": "A", "b": "B"}
     assert parallel_map(abs, []) == []
+
+
+def test_iterated_results_have_the_order_of_the_items() -> None:
+    first_may_end = threading.Event()
+
+    def square(number: int) -> int:
+        if number == 0:
+            assert first_may_end.wait(timeout=30)
+        if number == 3:
+            first_may_end.set()  # The other thread goes on while the first item takes long.
+        return number**2
+
+    assert list(iterate_results(square, range(50))) == [number**2 for number in range(50)]
+    assert list(iterate_results(abs, [])) == []
+
+
+def test_iterated_results_take_few_items_ahead() -> None:
+    taken: list[int] = []
+
+    def items() -> Iterator[int]:
+        for number in range(50):
+            taken.append(number)
+            yield number
+
+    results = iterate_results(abs, items())
+    assert next(results) == 0 and len(taken) == 5  # twice the number of threads, and the one that follows
+    results.close()
+    assert len(taken) == 5
+
+
+def test_an_error_ends_iterated_results_after_calls_that_have_begun() -> None:
+    begun: list[int] = []
+    ended: list[int] = []
+    failed = threading.Event()
+
+    def fail_at_two(number: int) -> int:
+        begun.append(number)
+        if number == 2:
+            failed.set()
+            raise ValueError("2")
+        if number == 3:
+            failed.wait(timeout=30)
+        ended.append(number)
+        return number
+
+    results = iterate_results(fail_at_two, range(50))
+    assert [next(results), next(results)] == [0, 1]
+    with pytest.raises(ValueError, match="2"):
+        next(results)
+    assert sorted(ended + [2]) == sorted(begun) and len(begun) < 50
+
+
+def test_iterated_results_for_a_gpu_are_computed_one_after_the_other() -> None:
+    threads = list(iterate_results(lambda _: threading.current_thread(), [0, 1, 2], torch.device("cuda")))
+    assert threads == 3 * [threading.current_thread()]
 
 
 @pytest.mark.parametrize("count", [0, 1, ROWS_PER_BLOCK, 2 * ROWS_PER_BLOCK + 1])
