@@ -160,6 +160,7 @@ def make_observed_scene(
     config = MakeConfig() if config is None else config
     check_type("config", config, MakeConfig)
     start_seconds = monotonic()
+    pipeline: _Pipeline | None = None
     max_size = requested_quality(config).max_size if config.max_size is None else config.max_size
     load_settings = LoadSettings(config.images, max_size, config.test_every)
     with interruptible():
@@ -181,11 +182,26 @@ def make_observed_scene(
                 observing or nullcontext() as observer,
             ):
                 with context.open_progress(interruptible=False) as progress:
-                    return _Pipeline(request, observer, start_seconds, context, progress).run()
+                    pipeline = _Pipeline(request, observer, start_seconds, context, progress)
+                    return pipeline.run()
         except Stopped:
             raise
-        except KeyboardInterrupt as error:  # interrupted before the stages
-            raise Stopped("preparation") from error
+        except KeyboardInterrupt as error:  # outside of a stage, or the second one
+            stop = _find_stopped(error)
+            if stop is not None:
+                raise stop from error
+            raise Stopped("preparation" if pipeline is None else pipeline.stage_cache.stage) from error
+
+
+def _find_stopped(error: BaseException) -> Stopped | None:
+    """Return the `Stopped` during whose handling an interrupt came, as while files were closed; None if there is none.
+
+    It names the interrupted stage and its preview, which the second interrupt does not know.
+    """
+    context = error.__context__
+    while context is not None and not isinstance(context, Stopped):
+        context = context.__context__
+    return context
 
 
 class _Pipeline:
@@ -222,17 +238,8 @@ class _Pipeline:
         """Run all stages that the source needs.
 
         Raises:
-            Stopped: the call was interrupted in a stage or after it.
+            Stopped: a stage was interrupted.
         """
-        try:
-            return self._run_stages()
-        except Stopped:
-            raise
-        except KeyboardInterrupt as error:
-            raise Stopped(self.stage_cache.stage) from error
-
-    def _run_stages(self) -> MakeResult:
-        """Run all stages that the source needs."""
         kind = self.source.kind
         if kind == "model":
             return self._finish(self.source.path, scene=None)

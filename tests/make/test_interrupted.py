@@ -93,6 +93,33 @@ def test_an_interrupt_between_two_stages_names_the_finished_one(posed, tmp_path,
     assert make_scene(posed, tmp_path / "scene.html").kept == ("training",)
 
 
+@contextmanager
+def interrupted_when_closed(*arguments) -> Iterator[None]:
+    """Stand in for a context manager during whose exit Ctrl-C is pressed."""
+    try:
+        yield
+    finally:
+        raise KeyboardInterrupt
+
+
+def test_a_second_interrupt_keeps_the_stage_and_preview_of_the_first(posed, tmp_path, monkeypatch):
+    def stop(*arguments, **options):
+        raise Stopped("training", tmp_path / PREVIEW_FILE)
+
+    monkeypatch.setattr(stages, "train_model", stop)
+    monkeypatch.setattr(run, "exclusive_folder", interrupted_when_closed)
+    with pytest.raises(Stopped, match="stopped in training") as stopped:
+        make_scene(posed, tmp_path / "scene.html")
+    assert stopped.value.preview == tmp_path / PREVIEW_FILE
+
+
+def test_an_interrupt_after_all_stages_names_the_last_one(posed, tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "exclusive_folder", interrupted_when_closed)
+    with pytest.raises(Stopped, match="stopped in export"):
+        make_scene(posed, tmp_path / "scene.html")
+    assert (tmp_path / "scene.html").is_file()
+
+
 def test_an_interrupt_on_a_full_disk_is_still_an_interrupt(posed, tmp_path, monkeypatch):
     def fill_disk_and_stop(*arguments, **options):
         monkeypatch.setattr("hyrfpack.make.state.write_atomic", fail)
