@@ -98,28 +98,34 @@ def assign_masks(views: Sequence[View], folder: Path, others: Sequence[View] = (
 
     Args:
         views: views of photos on disk.
-        folder: the folder of masks, which are found by name as by `find_masks`. Masks that match no photo, also none of
-            `others`, are logged.
+        folder: the folder of masks, which are found by name as by `find_masks`. A mask of a panorama has the panorama's
+            name and applies to all of its faces. Masks that match no photo, also none of `others`, are logged.
         others: views of photos whose masks are not used.
 
     Raises:
         HyrfDataError: the folder has no mask of these photos, or a mask has another aspect ratio than its photo.
     """
     loaders = {view.name: view.load for view in views if isinstance(view.load, PhotoFile | FaceFile)}
-    sizes = [(view.name, view.load.stored) for view in (*views, *others) if isinstance(view.load, PhotoFile | FaceFile)]
-    found = find_masks(folder, sizes, set(), allow_shared=False) if folder.is_dir() else MaskMatches()
-    if loaders.keys().isdisjoint(found.by_photo):
-        example = f", such as {Path(views[0].name).stem}.png" if views else ""
+    photo_names = {view.name: _photo_name(view) for view in (*views, *others)}
+    sizes = {
+        photo_names[view.name]: view.load.stored
+        for view in (*views, *others)
+        if isinstance(view.load, PhotoFile | FaceFile)
+    }
+    found = find_masks(folder, [*sizes.items()], set(), allow_shared=False) if folder.is_dir() else MaskMatches()
+    mask_by_view = {name: found.by_photo[photo_names[name]] for name in loaders if photo_names[name] in found.by_photo}
+    if not mask_by_view:
+        example = f", such as {Path(photo_names[views[0].name]).stem}.png" if views else ""
         raise HyrfDataError(
             f"{folder}: {'no mask has the name of a photo' if folder.is_dir() else 'there is no such folder'}",
             fix=f"name a folder with masks that have their photos' names{example}",
         )
     for note in found.notes:
         _LOG.warning(note)
-    masked_views = [view for view in views if view.name in found.by_photo]
+    masked_views = [view for view in views if view.name in mask_by_view]
     masked_photos = []
     for view in masked_views:
-        load, mask = loaders[view.name], found.by_photo[view.name]
+        load, mask = loaders[view.name], mask_by_view[view.name]
         if isinstance(load, PhotoFile) and mask.resolve() == load.path.resolve():
             raise HyrfDataError(f"{folder}: it holds the photos themselves", fix="name the folder of their masks")
         masked_photos.append(MaskedPhoto(mask, load.stored, load.orientation if isinstance(load, PhotoFile) else 1))
@@ -128,6 +134,14 @@ def assign_masks(views: Sequence[View], folder: Path, others: Sequence[View] = (
         replace(view, load=_with_mask(loaders[view.name], photo.mask, orientation))
         for view, photo, orientation in zip(masked_views, masked_photos, orientations, strict=True)
     ]
+
+
+def _photo_name(view: View) -> str:
+    """Return the name of a view's photo; of a face, that of its panorama: "street.jpg" for "street_front.jpg"."""
+    load = view.load
+    if not isinstance(load, FaceFile):
+        return view.name
+    return view.name.removesuffix(f"_{load.face.name}{load.path.suffix}") + load.path.suffix
 
 
 def _with_mask(load: PhotoFile | FaceFile, mask: Path, orientation: int) -> PhotoFile | FaceFile:

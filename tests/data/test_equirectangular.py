@@ -11,6 +11,7 @@ from PIL import Image
 
 from hyrfpack.data import load_scene
 from hyrfpack.data.equirectangular import CUBE_FACES, cut_face, cut_panorama, face_lens, face_size, is_panorama
+from hyrfpack.data.masks import assign_masks
 from hyrfpack.errors import HyrfDataError
 
 
@@ -208,6 +209,19 @@ def test_faces_are_reduced_and_masked_with_their_panorama(tmp_path):
     assert not views["a_down.png"].mask[10:30, 10:30].any() and views["a_up.png"].mask.all()
     assert 0 < (~views["a_front.png"].mask).mean() < 0.2  # in its middle, the face reaches 45 degrees below the horizon
     assert views["b_down.png"].mask is None
+
+
+def test_a_mask_with_the_name_of_a_panorama_is_assigned_to_all_its_faces(tmp_path):
+    write_posed_panoramas(tmp_path)
+    mask = np.zeros((128, 256), np.uint8)
+    mask[:40] = 255  # the sky
+    (tmp_path / "skies").mkdir()
+    Image.fromarray(mask).save(tmp_path / "skies" / "a.png")
+
+    views = {view.name: view for view in assign_masks(load_scene(tmp_path, test_every=0).views, tmp_path / "skies")}
+
+    assert views.keys() == {f"a_{face.name}.png" for face in CUBE_FACES}
+    assert views["a_up.png"].load().mask[10:30, 10:30].all() and not views["a_down.png"].load().mask.any()
 
 
 def test_transparent_pixels_of_a_panorama_are_ignored_like_masked_ones(tmp_path):
