@@ -13,6 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
+from hyrfpack.colmap_library import keep_sigterm_handler
 from hyrfpack.errors import HyrfError, install_command, short_reason
 from hyrfpack.parallel.threads import thread_count
 from hyrfpack.version import __version__
@@ -207,7 +208,8 @@ def _version(package: str) -> str | None:
 def _import_problem(module: str) -> str | None:
     """Return why a package that is installed cannot be imported; None if it can, or if it is not installed."""
     try:
-        import_module(module)
+        with keep_sigterm_handler():  # one of the modules is pycolmap
+            import_module(module)
     except ModuleNotFoundError as error:
         if error.name == module:
             return None

@@ -120,3 +120,11 @@ def test_sigterm_has_no_handler_of_pycolmap(handler, folder):
     assert done.stderr == ""
     expected = (0, "asked to stop\n") if handler else (-signal.SIGTERM, "")
     assert (done.returncode, done.stdout) == expected
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no handlers of SIGTERM")
+def test_the_report_of_a_machine_leaves_no_handler_of_pycolmap(tmp_path):
+    code = "import os, signal, sys, hyrfpack\nhyrfpack.diagnose_machine('cpu', self_test=False)\n"
+    code += "assert 'pycolmap' in sys.modules\nos.kill(os.getpid(), signal.SIGTERM)\n"
+    done = run_in_new_interpreter(code, tmp_path)
+    assert (done.stderr, done.returncode) == ("", -signal.SIGTERM)
