@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
@@ -18,6 +18,7 @@ from hyrfpack.ops.viewport import Viewport
 from hyrfpack.parallel.pool import parallel_map
 from hyrfpack.progress import Progress, count_calls, ignore_progress
 from hyrfpack.render import render_view
+from hyrfpack.render.exposure import apply_exposure_map
 from hyrfpack.scene import Camera, View
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.splats import Splats
@@ -45,6 +46,7 @@ def measure_psnr(
     views: Sequence[tuple[Camera, View | None]],
     *,
     sphere: bool,
+    consistent: Collection[str] = (),
     progress: Progress = ignore_progress,
 ) -> dict[str, PsnrScores]:
     """Measure the PSNR of pictures of splats against those of a model, and against photos.
@@ -52,16 +54,18 @@ def measure_psnr(
     Args:
         model: the model from which the splats were baked. It is scored, too, under the name "model".
         candidates: splats by name, each with its background: an equirectangular picture (H, 2H, 3) as
-            `render_background_picture` makes it, or None for the model's solid colour.
+            `render_background_picture` makes it, or None for the model's solid colour, to which the exposure map is
+            applied as in the model's pictures.
         views: cameras, with their photos or None. Photos are scored if all views have them.
         sphere: whether the model is rendered with its background sphere.
+        consistent: names of the candidates of consistent exposure, behind which the solid colour is not exposed.
         progress: called with `TaskEvent`s.
 
     Returns:
         Scores by candidate, and those of the model as "model"; empty if the masks of the photos leave no pixel.
     """
-    decoded, config = model.decode(), scene_of(model).config
-    solid = torch.tensor(config.solid)
+    decoded, scene = model.decode(), scene_of(model)
+    config, solid = scene.config, torch.tensor(scene.config.solid)
     drawables = {
         name: (Drawable.from_splats(splats, config.frame), panorama) for name, (splats, panorama) in candidates.items()
     }
@@ -71,9 +75,13 @@ def measure_psnr(
         camera, view = viewpoint
         model_picture = to_8bit(render_view(model, camera, decoded=decoded, background=sphere).rgb)
         pictures = {"model": model_picture}
+        exposed_solid = apply_exposure_map(scene, camera, solid)
         for name, (drawable, panorama) in drawables.items():
             raster = draw(drawable, camera)
-            backdrop = solid if panorama is None else _sample_panorama(torch.from_numpy(panorama), camera)
+            if panorama is None:
+                backdrop = solid if name in consistent else exposed_solid
+            else:
+                backdrop = _sample_panorama(torch.from_numpy(panorama), camera)
             pictures[name] = to_8bit(raster.rgb + raster.transmittance[..., None] * backdrop)
         photo, mask = (None, None) if view is None else _load_photo(view, config.solid)
         if mask is not None and not mask.any():

@@ -6,7 +6,7 @@ import logging
 import math
 from dataclasses import replace
 
-from hyrfpack.choices import SPLAT_EXPOSURES
+from hyrfpack.choices import CONSISTENT_EXPOSURE, SPLAT_EXPOSURES
 from hyrfpack.counts import format_count
 from hyrfpack.export.baked_scene import BakedScene, SplatsWithBackground
 from hyrfpack.export.measure import PsnrScores, measure_psnr
@@ -92,7 +92,12 @@ def _warn_of_cost(cost: float, loaded: Source, kind: FileKind) -> None:
 def _add_exposure_scores(result: ExportReport, loaded: Source, baked: BakedScene, progress: Progress) -> ExportReport:
     """Add the scores of splats of both exposures, against the model as photographed and against photos."""
     scores = measure_psnr(
-        loaded.all_parts, baked.by_exposure, loaded.measured_views, sphere=baked.sphere, progress=progress
+        loaded.all_parts,
+        baked.by_exposure,
+        loaded.measured_views,
+        sphere=baked.sphere,
+        consistent=(CONSISTENT_EXPOSURE,),
+        progress=progress,
     )
     by_exposure = {name: scores[name] for name in SPLAT_EXPOSURES if name in scores}
     return replace(

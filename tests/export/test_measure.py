@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from exposures import map_with_gains
 from scenes import camera_at, ring, small_model, view_of
 
 from hyrfpack.export.background import render_background_picture
@@ -99,6 +100,18 @@ def test_transparent_photos_are_composited_on_the_solid_color():
     clear = Picture(np.zeros((32, 32, 3), np.uint8), np.zeros((32, 32), np.uint8))
     scores = measure_psnr(model, {}, [(RING_CAMERAS[0], view_of("photo", RING_CAMERAS[0], clear))], sphere=False)
     assert scores["model"].photos == 100
+
+
+def test_a_solid_colour_behind_splats_is_exposed_as_in_renders_of_the_model():
+    model = small_model(GAUSSIAN_POSITIONS, solid=(0.2, 0.4, 0.6), **INVISIBLE_SETTINGS)
+    model.exposure = map_with_gains(RING_CAMERAS, model.config.frame, np.array([[0.5], [2.0], [3.0]]))
+    candidates = {"local": (empty_splats(), None), "consistent": (empty_splats(), None)}
+
+    scores = measure_psnr(
+        model, candidates, [(c, None) for c in RING_CAMERAS], sphere=False, consistent=("consistent",)
+    )
+
+    assert scores["local"].model == 100 and scores["consistent"].model < 25
 
 
 def test_masked_pixels_and_fully_masked_views_are_ignored():
