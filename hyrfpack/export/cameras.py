@@ -54,8 +54,10 @@ def write_colmap(
     points: Splats | None,
     *,
     overwrite: bool = True,
-) -> None:
-    """Write a binary COLMAP model to `folder`/sparse/0. The photo folder belongs at `folder`/images.
+) -> int:
+    """Write a binary COLMAP model to `folder`/sparse/0, and return its size in bytes.
+
+    The photo folder belongs at `folder`/images.
 
     The model has one PINHOLE camera for each distinct size and intrinsics, and one image without observations for each
     photo, all numbered from 1 in order. The points, from which a trainer can start, are evenly picked centres of
@@ -90,14 +92,16 @@ def write_colmap(
         for position, color in zip(chosen.positions, colors, strict=True):
             model.add_point3D(position, pycolmap.Track(), color)
 
-    target = Path(folder, "sparse", "0")
+    target, total_bytes = Path(folder, "sparse", "0"), 0
     with tempfile.TemporaryDirectory() as temporary, ExitStack() as tables:
         model.write_binary(temporary)
         for table in sorted(Path(temporary).iterdir()):
             data = table.read_bytes()
+            total_bytes += len(data)
             # The files get their final names when the block ends.
             pending = pending_file(target / table.name, len(data), overwrite=overwrite, rename=False)
             tables.enter_context(pending).temporary.write_bytes(data)
+    return total_bytes
 
 
 def encode_transforms(cameras: Sequence[tuple[str, Camera]]) -> bytes:

@@ -264,8 +264,7 @@ def _write_points(baked: BakedScene, target: Path, kind: FileKind, overwrite: bo
     """Write the centres of splats as points, and the cameras."""
     named_cameras, up = baked.source.cameras, baked.source.up
     if kind is COLMAP_FOLDER:
-        write_colmap(named_cameras, target, baked.splats, overwrite=overwrite)
-        size = sum(table.stat().st_size for table in Path(target, "sparse", "0").glob("*.bin"))
+        size = write_colmap(named_cameras, target, baked.splats, overwrite=overwrite)
         return ExportReport(str(target), size, cameras=len(named_cameras))
     cameras = [camera for _, camera in named_cameras]
     data = encode_points(baked.splats, cameras, "glb" if kind.ending.endswith("glb") else "ply", up)
