@@ -38,13 +38,15 @@ def choose_sources(cameras: Sequence[Camera], points: np.ndarray, seen: Sequence
         `MIN_SHARED_POINTS` points are left out, and those where the median angle is below `MIN_ANGLE_DEGREES` or above
         `MAX_ANGLE_DEGREES`.
     """
-    shows = np.zeros((len(cameras), len(points)), bool)
-    for row, indices in zip(shows, seen, strict=True):
-        row[indices] = True
+    shown = [np.unique(indices) for indices in seen]
     centers = [camera.position for camera in cameras]
     scores = np.zeros((len(cameras), len(cameras)))
+    is_shown = np.zeros(len(points), bool)  # by the first photo of a pair
     for first, second in combinations(range(len(cameras)), 2):
-        shared = np.flatnonzero(shows[first] & shows[second])
+        if second == first + 1:
+            is_shown[:] = False
+            is_shown[shown[first]] = True
+        shared = shown[second][is_shown[shown[second]]]
         if len(shared) >= MIN_SHARED_POINTS:
             sampled = shared[:: -(-len(shared) // MAX_MEASURED_POINTS)]
             angles = _triangulation_angles(points[sampled], centers[first], centers[second])
