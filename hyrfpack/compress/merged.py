@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from hyrfpack.data.masked_views import mask_differing_pixels
 from hyrfpack.errors import HyrfError, named_in_errors
 from hyrfpack.format.container import Container, read_container
 from hyrfpack.format.info import FileReport
+from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.part_names import open_parts
 from hyrfpack.format.parts import decode_parts, encode_parts, write_parts
 from hyrfpack.format.sections import PART_NAMES, SECTION_CONTENTS
@@ -23,6 +25,8 @@ from hyrfpack.outputs import StrPath
 from hyrfpack.progress import Progress, part_of_progress
 from hyrfpack.render import render_view
 from hyrfpack.scene import View
+
+_LOG = logging.getLogger(__name__)
 
 
 def is_merged(path: Path) -> bool:
@@ -37,9 +41,18 @@ def name_part(source: Path, name: str) -> str:
 
 
 def iterate_parts(source: Path, progress: Progress) -> Iterator[tuple[str, Path, Progress]]:
-    """Yield name, file and progress of each part of a merged file. A file lasts until the next one is asked for."""
+    """Yield name, file and progress of each part of a merged file. A file lasts until the next one is asked for.
+
+    Empty parts, which earlier versions wrote, show nothing and are left out. The first one shows its background and is
+    kept.
+    """
     with Container.open(source, SECTION_CONTENTS) as container, tempfile.TemporaryDirectory() as folder:
-        models = open_parts(container)
+        models = list[tuple[str, Container]]()
+        for name, part in open_parts(container):
+            if not models or read_metadata(part).gaussians:
+                models.append((name, part))
+            else:
+                _LOG.info(f"{name_part(source, name)} holds no Gaussian and is left out")
         for number, (name, part) in enumerate(models):
             loose = Path(folder, "part.hyrf")
             write_atomic(loose, part.read_bytes())
@@ -49,7 +62,7 @@ def iterate_parts(source: Path, progress: Progress) -> Iterator[tuple[str, Path,
 def compress_parts(
     source: Path,
     target: StrPath,
-    compress_part: Callable[[Path, Path, Progress], FileReport],
+    compress_part: Callable[[Path, Path, Progress], object],
     progress: Progress,
     *,
     overwrite: bool,

@@ -19,10 +19,11 @@ from hyrfpack.compress.report import CompressionReport
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.config.compress import CompressConfig
 from hyrfpack.context import RunContext
+from hyrfpack.copying import copy_file
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError, named_in_errors
 from hyrfpack.format.codec import load_parts, load_with_provenance, packed_provenance, repack, write_model
-from hyrfpack.format.info import FileReport, describe_file
+from hyrfpack.format.info import describe_file
 from hyrfpack.format.min_file_size import check_target_above, check_target_bytes, min_merged_file_bytes
 from hyrfpack.format.parts import write_merged
 from hyrfpack.format.run_folder import find_model
@@ -140,10 +141,13 @@ def _compress_merged(
         return CompressionReport(**vars(written), shares=_error_shares(candidate), error=error, found=found)
     photos = data  # which show the first part, the scene
 
-    def compress_part(loose: Path, packed: Path, progress: Progress) -> FileReport:
+    def compress_part(loose: Path, packed: Path, progress: Progress) -> None:
         nonlocal photos
         own, photos = photos, None
-        return _compress_single(loose, packed, config, own, True, replace(context, progress=progress))
+        if config.profile == "compact" and not describe_file(loose)["gaussians"]:
+            copy_file(loose, packed)  # nothing can be measured of a scene that is all background
+        else:
+            _compress_single(loose, packed, config, own, True, replace(context, progress=progress))
 
     with context.open_progress("compress") as progress:
         written = compress_parts(source, target, compress_part, progress, overwrite=overwrite)
@@ -181,7 +185,9 @@ def _encode_merged(
 def _check_merged_target(source: Path, target_bytes: int) -> None:
     """Raise HyrfError if no merged file of the parts is as small as the target size."""
     parts = [
-        (name, packed_provenance(provenance, model), model.exposure) for name, model, provenance in load_parts(source)
+        (name, packed_provenance(provenance, model), model.exposure)
+        for number, (name, model, provenance) in enumerate(load_parts(source))
+        if len(model) or number == 0  # `iterate_parts` leaves the others out
     ]
     check_target_above(target_bytes, min_merged_file_bytes(parts))
 

@@ -45,6 +45,7 @@ from hyrfpack.edit import edit_model, floaters, merge_models, plan_edit
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import psnr
 from hyrfpack.format import describe_file, load_merged_model, load_model, save_model
+from hyrfpack.format.parts import write_parts
 from hyrfpack.render import render_view
 
 pytestmark = pytest.mark.usefixtures("quick_calibration")
@@ -221,6 +222,26 @@ def test_a_message_about_a_part_that_cannot_be_compressed_names_file_and_part(me
     merge_models([merged.with_name("toy.hyrf"), tmp_path / "far.hyrf"], tmp_path / "two.hyrf")
     with pytest.raises(HyrfError, match=r"two.hyrf: part 'far': none of its \d+ cameras sees a Gaussian"):
         compress_model(tmp_path / "two.hyrf", tmp_path / "out.hyrf", context=QUIET_CONTEXT)
+
+
+def write_merged_with_empty_part(merged: Path, folder: Path, *, is_first: bool) -> Path:
+    """Write a merged file as earlier versions wrote it, with an empty part that has a background."""
+    save_model(small_model(np.zeros((0, 3)), fields=0.5, background=True), folder / "empty.hyrf", "raw")
+    parts = [(name, merged.with_name(f"{name}.hyrf").read_bytes()) for name in ("room", "toy")]
+    parts.insert(0 if is_first else 1, ("empty", (folder / "empty.hyrf").read_bytes()))
+    return Path(write_parts(parts, folder / "old.hyrf").file)
+
+
+@pytest.mark.parametrize("is_first", [False, True])
+def test_an_empty_part_of_a_merged_file_is_no_obstacle_to_compression(is_first, merged, tmp_path):
+    old = write_merged_with_empty_part(merged, tmp_path, is_first=is_first)
+
+    compress_model(old, tmp_path / "out.hyrf", context=QUIET_CONTEXT)
+
+    names = [part["name"] for part in describe_file(tmp_path / "out.hyrf")["parts"]]
+    assert names == (["empty", "room", "toy"] if is_first else ["room", "toy"])
+    renders = [render_view(load_merged_model(path), CAMERAS[0]).rgb for path in (old, tmp_path / "out.hyrf")]
+    assert psnr(*renders) > 35
 
 
 def test_an_edit_that_leaves_nothing_is_refused(merged, tmp_path):
