@@ -4,19 +4,20 @@
 import { Color, LinearSRGBColorSpace, PerspectiveCamera, Scene, Vector3, WebGPURenderer } from "three/webgpu";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
+import { followWindow } from "./follow-window.js";
 import { loadHyrf } from "./hyrf-harmonics.js";
 import { lookFrom } from "./look-from.js";
 
 const params = new URLSearchParams(location.search), statusLine = document.getElementById("status");
 const renderer = new WebGPURenderer({ forceWebGL: params.has("webgl") });
 renderer.outputColorSpace = LinearSRGBColorSpace; // because the file's colours are display-referred
-renderer.setPixelRatio(devicePixelRatio);
 document.body.append(renderer.domElement);
 const scene = new Scene(), camera = new PerspectiveCamera(), controls = new OrbitControls(camera, renderer.domElement);
 
 const fit = () => {
   camera.aspect = innerWidth / innerHeight;
   camera.updateProjectionMatrix();
+  renderer.setPixelRatio(devicePixelRatio);
   renderer.setSize(innerWidth, innerHeight);
 };
 
@@ -29,8 +30,7 @@ const show = (object) => {
   controls.update();
 };
 
-addEventListener("resize", fit);
-fit();
+followWindow(fit);
 renderer.setAnimationLoop(() => renderer.render(scene, camera));
 try {
   const onProgress = (done) => (statusLine.textContent = `${Math.round(100 * done)} %`);

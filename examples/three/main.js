@@ -3,6 +3,7 @@
 import { Color, PerspectiveCamera, SRGBColorSpace, Scene, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
+import { followWindow } from "./follow-window.js";
 import { HyrfObject } from "./hyrf-object.js";
 import { lookFrom } from "./look-from.js";
 
@@ -31,9 +32,8 @@ const fit = () => {
   requestFrame();
 };
 
-addEventListener("resize", fit);
 controls.addEventListener("change", requestFrame);
-fit();
+followWindow(fit);
 try {
   const object = await HyrfObject.load(file, {
     onProgress: ({ step, part }) => (statusLine.textContent = `${step} ${Math.round(100 * part)} %`),

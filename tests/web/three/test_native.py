@@ -404,6 +404,8 @@ def test_the_example_page_shows_the_model_without_blocking(three_browser: Chromi
     shown = np.array(Image.open(io.BytesIO(picture)).convert("RGB"), np.float64)
     camera = save_model_camera()
     assert psnr(shown, render(app_folder / "balls.hyrf", camera)) > 40
+    three_browser.resize(SIZE_PIXELS, SIZE_PIXELS, pixel_ratio=2)  # as on another screen
+    wait_until(three_browser, f"document.querySelector('canvas').width === {2 * SIZE_PIXELS}")
     assert three_browser.list_errors() == []
 
 

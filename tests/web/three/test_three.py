@@ -17,6 +17,7 @@ from PIL import Image
 from scenes import ball_points, ring, small_model
 from scipy.spatial.transform import Rotation
 from web.fields.test_harmonics import fit_in_node
+from web.pages import wait_until
 from web.scripts import run_script
 from web.served import serve_project
 
@@ -178,6 +179,8 @@ def test_the_example_page_shows_the_rendered_picture(app_folder: Path, tmp_path:
         time.sleep(1.5)  # lets the page draw some frames
         picture = np.array(Image.open(io.BytesIO(browser.screenshot())).convert("RGB"), np.float32) / 255
         complaints = browser.list_errors()
+        browser.resize(PICTURE_SIZE_PIXELS, PICTURE_SIZE_PIXELS, pixel_ratio=2)  # as on another screen
+        wait_until(browser, f"document.querySelector('canvas').width === {2 * PICTURE_SIZE_PIXELS}")
 
     own = render_view(make_model(), cameras_around_model(10)[0]).rgb.detach()
     assert not [line for line in complaints if "WebGPU" not in line], json.dumps(complaints)
