@@ -264,6 +264,28 @@ def test_an_undo_during_a_drag_of_a_handle_removes_the_box(browser: Browser, tmp
     assert list_actions(browser) == [] and browser.list_errors() == []
 
 
+@pytest.mark.parametrize("other", ["the same handle", "another handle"])
+def test_a_second_finger_does_not_disturb_the_drag_of_a_handle(browser: Browser, tmp_path: Path, other: str):
+    browser.resize(1000, 700, phone=True)
+    load_editable_page(browser, tmp_path, make_editable_page(make_model()))
+    click(browser, "#edit-add-box")
+    before = list_actions(browser)[0]["value"]
+    x, y = middle_of(browser, "#edit-handles button", 1)  # maximum x
+    second = (x + 8, y + 8) if other == "the same handle" else middle_of(browser, "#edit-handles button", 3)
+    browser.touch("touchStart", (x, y))
+    browser.touch("touchMove", (x + 20, y))
+    first = list_actions(browser)[0]["value"]
+    browser.touch("touchStart", (x + 20, y), second)
+    for step in (40, 80):
+        browser.touch("touchMove", (x + 20, y), (second[0] + step, second[1] - step))
+    assert list_actions(browser)[0]["value"] == first != before
+    browser.touch("touchMove", (x + 40, y), (second[0] + 80, second[1] - 80))
+    browser.touch("touchEnd")
+    after = list_actions(browser)[0]["value"]
+    assert after[:3] == before[:3] and after[4:] == before[4:]
+    assert abs(after[3] - before[3]) > 1.5 * abs(first[3] - before[3])
+
+
 def test_undo_moves_the_slider_that_has_the_focus(browser: Browser, tmp_path: Path):
     load_editable_page(browser, tmp_path, make_editable_page(make_model(50)), tool="clean")
     fill(browser, "#edit-faint", 20)

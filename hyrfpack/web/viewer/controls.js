@@ -58,10 +58,11 @@ export class Controls {
     return this.player.eye; // null until a scene is loaded
   }
 
-  // Sets whether the canvas uses wheel and fingers, or leaves them to the surrounding page.
+  // Sets whether the canvas uses wheel and fingers, or leaves them to the surrounding page, to
+  // scroll and to zoom it.
   engage(engaged) {
     this.engaged = engaged;
-    this.canvas.style.touchAction = engaged ? "none" : "pan-x pan-y";
+    this.canvas.style.touchAction = engaged ? "none" : "manipulation";
   }
 
   // Returns whether a key that moves the eye, a mouse button or a finger is down.

@@ -55,19 +55,20 @@ export class CropBox {
     return handle;
   }
 
-  // Drags a handle until the pointer is released.
+  // Drags a handle until the pointer is released. Only the first of several fingers drags.
   press(event, handle, grab) {
-    if (event.button) return;
+    if (event.button || !event.isPrimary) return;
     event.preventDefault();
     handle.focus();
     handle.setPointerCapture(event.pointerId);
     const follow = grab.call(this, event);
     handle.onpointermove = (moved) => {
-      const value = follow(moved);
+      const value = moved.isPrimary && follow(moved);
       if (value) this.change({ value }, false);
     };
-    handle.onpointerup = handle.onpointercancel = handle.onlostpointercapture = () => {
-      handle.onpointermove = handle.onpointerup = handle.onpointercancel = handle.onlostpointercapture = null;
+    handle.onlostpointercapture = (lost) => { // after the release, or after the browser has cancelled the touch
+      if (!lost.isPrimary) return;
+      handle.onpointermove = null;
       this.change({});
     };
   }
@@ -130,17 +131,10 @@ export class CropBox {
     return sign ? withTurn(this.getBox().value, sign * KEY_STEP_DEGREES * (event.shiftKey ? SHIFT_FACTOR : 1)) : null;
   }
 
-  // Chooses an arm whose handle can be reached. It stays the same as long as it can.
-  chooseArm(box) {
-    const isReachable = ([, end]) => isFree(this.projection.place(end)), arms = turnArms(box);
-    if (!isReachable(arms[this.arm])) this.arm = Math.max(0, arms.findIndex(isReachable));
-  }
-
   // Returns the twelve edges, and the arm of the handle that turns the box.
   get segments() {
     const box = this.getBox();
     if (!box) return [];
-    if (this.projection) this.chooseArm(box);
     const edges = [0, 1, 2].flatMap((axis) => [[0, 0], [0, 1], [1, 0], [1, 1]].map((others) => {
       const ends = [0, 1].map((end) => others.toSpliced(axis, 0, end));
       return ends.map((end) => box.corner(...end));
@@ -148,11 +142,12 @@ export class CropBox {
     return [...edges, turnArms(box)[this.arm]];
   }
 
-  // Puts the handles where they belong.
+  // Puts the handles where they belong. The one that turns the box stays at its arm while it can be reached there.
   place(projection) {
     const box = this.getBox();
     this.projection = projection;
-    if (box) this.chooseArm(box);
+    const isReachable = ([, end]) => isFree(projection.place(end)), arms = box && turnArms(box);
+    if (box && !isReachable(arms[this.arm])) this.arm = Math.max(0, arms.findIndex(isReachable));
     const show = (handle, point) => {
       const place = point && projection.place(point);
       handle.hidden = !place;
@@ -163,7 +158,7 @@ export class CropBox {
       if (box) this.handles[number].setAttribute("aria-valuenow", box.value[axis + 3 * side]);
     }
     show(this.mover, box && box.middle);
-    show(this.turner, box && turnArms(box)[this.arm][1]);
+    show(this.turner, box && arms[this.arm][1]);
     if (box) this.turner.setAttribute("aria-valuenow", box.value[6] ?? 0);
   }
 }

@@ -14,7 +14,7 @@ const create = (name, attributes, text = "") => {
 
 export class Overlay {
   // `list()` returns what is drawn: {segments: [[from, to]], points, labels: [{at, text}]} in the page's coordinates.
-  // `placed(projection)` is called with each view that is drawn.
+  // `placed(projection)` is called before with each view that is drawn.
   constructor(player, list, placed) {
     Object.assign(this, { player, list, placed });
     this.svg = element("edit-overlay");
@@ -28,7 +28,9 @@ export class Overlay {
 
   draw() {
     if (!this.player.loaded) return;
-    const { projection } = this, { segments = [], points = [], labels = [] } = this.list();
+    const { projection } = this;
+    this.placed(projection);
+    const { segments = [], points = [], labels = [] } = this.list();
     const lines = segments.map(([from, to]) => projection.segment(from, to)).filter(Boolean);
     const d = lines.map(([from, to]) => `M${from.map(Math.round)}L${to.map(Math.round)}`).join("");
     const shapes = d ? [create("path", { d, class: "outline" }), create("path", { d })] : [];
@@ -41,6 +43,5 @@ export class Overlay {
       if (place) shapes.push(create("text", { x: place[0] + 12, y: place[1] - 10 }, text));
     }
     this.svg.replaceChildren(...shapes);
-    this.placed(projection);
   }
 }
