@@ -374,6 +374,20 @@ def test_a_frame_whose_src_is_no_address_shows_nothing_until_it_is_corrected(bro
     wait_until(browser, LOADED_JS)
 
 
+def test_a_frame_reports_a_poster_that_is_no_address_once(browser: Browser, host: Site):
+    open_element(browser, host, 'frame src="cloud.spz" poster="http://"')
+    errors = "fired.filter(([name, detail]) => name === 'error' && detail.startsWith('poster is no address')).length"
+    wait_until(browser, LOADED_JS)
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('title', 'a title')")
+    wait_until(browser, f"{ELEMENT_JS}.shadowRoot.querySelector('iframe').title === 'a title'")
+    assert browser.evaluate(errors) == 1
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('poster', 'http://[')")  # another mistake
+    wait_until(browser, f"{errors} === 2")
+    browser.evaluate(f"{ELEMENT_JS}.removeAttribute('poster')")
+    browser.evaluate(f"{ELEMENT_JS}.setAttribute('poster', 'http://[')")  # the same again
+    wait_until(browser, f"{errors} === 3")
+
+
 @pytest.mark.parametrize(
     ("attribute", "words"),
     [('camera="99"', "no camera 99"), ('camera="%"', "The camera"), ('exposure="dark"', "exposure")],

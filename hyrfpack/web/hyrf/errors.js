@@ -31,12 +31,12 @@ export const rejectDamaged = (reason) => {
 };
 
 /**
- * Throws the error for a file that needs a newer reader.
+ * Throws the error for a file that needs another version of the reader, which is mostly a newer one.
  * @param {string} reason
  * @returns {never}
  */
 export const rejectNewer = (reason) => {
-  throw new HyrfFormatError(`The file is newer than this reader: ${reason}; update the reader.`);
+  throw new HyrfFormatError(`The file cannot be read: ${reason}; update the reader.`);
 };
 
 /**

@@ -101,7 +101,9 @@ const readMajorVersion = (version) => {
   if (!match) throw new DamagedData("it has no version");
   const major = Number(match[1]);
   if (major >= 1 && major <= PARTS_VERSION) return major;
-  throw new HyrfFormatError(`The scene has version ${version}, newer than this reader; update the reader.`);
+  throw new HyrfFormatError(
+    `The scene has version ${version} and this reader knows versions 1 and ${PARTS_VERSION}; update the reader.`,
+  );
 };
 
 /**

@@ -19,6 +19,7 @@ export class FrameView {
     this.address = "";
     this.isMoved = false;
     this.isLoadFailed = false; // whether the player's last message was an error, or there was none
+    this.attributeErrors = new Set(); // the messages about attributes at the last update
     this.receiveMessage = this.receiveMessage.bind(this);
     addEventListener("message", this.receiveMessage);
   }
@@ -31,11 +32,17 @@ export class FrameView {
   // Follows the element's attributes.
   update() {
     const { element } = this, player = element.getAttribute("player") || addressBesideScript("index.html");
+    const reported = this.attributeErrors;
+    this.attributeErrors = new Set();
+    const report = (message) => {
+      this.attributeErrors.add(message);
+      if (!reported.has(message)) this.fail(message); // changes of other attributes do not repeat it
+    };
     let address;
     try {
       address = new URL(player ?? "", player ? document.baseURI : undefined);
     } catch {
-      return this.fail(`hyrf-viewer does not know where its player is; ${FIX_TEXT}`);
+      return report(`hyrf-viewer does not know where its player is; ${FIX_TEXT}`);
     }
     for (const [name, parameter] of [["src", "content"], ["poster", "poster"]]) {
       const value = element.getAttribute(name);
@@ -43,7 +50,7 @@ export class FrameView {
       try {
         address.searchParams.set(parameter, new URL(value, document.baseURI));
       } catch {
-        this.fail(`${name} is no address of a file: ${value}`);
+        report(`${name} is no address of a file: ${value}`);
         if (name === "src") return this.removeFrame(); // without its parameter, the player would show its own scene
       }
     }
@@ -113,8 +120,10 @@ export class FrameView {
     this.fail(`${address} is no player, or is not allowed to run here; ${FIX_TEXT}`);
   }
 
-  // Makes the next update load the scene again if its load has failed.
+  // Makes the next update load the scene again if its load has failed, and report again what is wrong with attributes
+  // if there is no scene to load.
   forgetFailedLoad() {
+    if (!this.frame) this.attributeErrors.clear();
     if (this.isLoadFailed) this.removeFrame();
   }
 

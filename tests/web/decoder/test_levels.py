@@ -238,3 +238,9 @@ def test_manifests_are_accepted_and_refused_as_in_python(tmp_path: Path):
         with pytest.raises(HyrfFormatError):
             parse_manifest(data)
         assert answer.get("refused", "").count("\n") == 0 and "refused" in answer, data
+
+
+@pytest.mark.parametrize("version", ["0.9", "3.0"])
+def test_a_manifest_of_an_unknown_version_is_refused_by_the_versions_that_are_read(version: str, tmp_path: Path):
+    (answer,) = run(tmp_path, [{"manifest": with_value(["version"], version)}])
+    assert f"version {version} and this reader knows versions 1 and 2" in answer["refused"]

@@ -106,6 +106,14 @@ def test_golden_files_decode_to_the_recorded_numbers():
             assert verdict.groups[group] == hashlib.sha256(numbers).hexdigest(), (file.stem, group)
 
 
+@pytest.mark.parametrize("major", [0, 2])
+def test_a_file_of_an_unknown_version_is_refused_by_the_version_that_is_read(major: int):
+    data = bytearray(GOLDEN_FILES[0].read_bytes())
+    data[8:12] = struct.pack("<2H", major, 3)
+    (verdict,) = read_in_javascript([(bytes(data), False)])
+    assert f"version {major}.3 and this reader knows version 1" in verdict.refused and "newer" not in verdict.refused
+
+
 def test_random_configurations_decode_to_the_same_numbers():
     files = {}
     for seed in range(6):

@@ -18,7 +18,7 @@ export declare class DamagedData extends Error {
  */
 export declare const rejectDamaged: (reason: string) => never;
 /**
- * Throws the error for a file that needs a newer reader.
+ * Throws the error for a file that needs another version of the reader, which is mostly a newer one.
  * @param {string} reason
  * @returns {never}
  */
