@@ -7,11 +7,13 @@
 // report when a pointer is released that was pressed elsewhere; `changes`: how many changes controls report when a key
 // that flies is pressed on their canvas, which lies in a dialog, and in a field of that dialog; `zooms`: the signs of
 // zooms by wheels, also by one with Shift, which browsers turn to the side, and by one to the side; `openErrors`: the
-// errors of a scene and of another one that replaces it, where both fail, the other one first; and `partEvents`: the
-// player's events when a part of a scene folder arrives that has the first exposure map of the scene, each with whether
-// the scene has a map by then.
+// errors of a scene and of another one that replaces it, where both fail, the other one first; `lateScenes`: the scenes
+// that are opened, and those whose download is cancelled, if the page's own scene arrives after the user has opened
+// another one, which fails, is shown, or is replaced by a third one that fails, too; and `partEvents`: the player's
+// events when a part of a scene folder arrives that has the first exposure map of the scene, each with whether the scene
+// has a map by then.
 
-globalThis.window = globalThis.self = globalThis;
+globalThis.window = globalThis.self = globalThis.parent = globalThis;
 const page = { body: { classList: { remove() {}, toggle() {} } }, getElementById: () => ({}) };
 globalThis.document = { baseURI: "http://host/", ...page };
 globalThis.location = new URL("http://host/");
@@ -111,6 +113,31 @@ for (const number of [1, 0]) {
   await opened[number];
 }
 
+// Opens scenes, each of which is still loading when the next one is opened. The first one arrives last of all. `ends` says
+// of the others, by their names, whether they fail. Returns the names of scenes that are shown, and those cancelled.
+async function openLate(ends) {
+  const shown = [], cancelled = [], scenes = new Map(), wait = () => new Promise((done) => setTimeout(done));
+  const openScene = ({ name }) => new Promise((done, failed) => {
+    scenes.set(name, () => (ends[name] ? failed(new Error(name)) : done(shown.push(name))));
+    if (name === "own") scenes.get(name)();
+  });
+  const late = new Opener({ open: openScene }, null, { title: "a scene" });
+  let arrive = null;
+  const own = late.open(() => new Promise((done) => (arrive = done)));
+  for (const name of Object.keys(ends)) {
+    late.open(async () => ({ name, stream: {} }), null, false).catch(() => {});
+    await wait();
+  }
+  arrive({ name: "own", stream: { cancel: () => cancelled.push("own") } });
+  for (const name of Object.keys(ends).reverse()) {
+    await wait();
+    scenes.get(name)();
+  }
+  await own;
+  return { shown, cancelled };
+}
+const lateScenes = [await openLate({ a: true }), await openLate({ a: false }), await openLate({ a: true, b: true })];
+
 const partEvents = [], place = { scale: 1 }, parts = [{ exposure: null, place }, { exposure: null, place }];
 player.scene = { near: 1, sortNear: 1, exposure: null, parts };
 player.emit = (name) => partEvents.push([name, hasExposureMap(player.scene)]);
@@ -119,5 +146,5 @@ streamed.addPart({ number: 1, part: 1, exposure: {}, place });
 
 const loaderError = error.constructor.name;
 const result = { loaderError, folderName, cancelled: cancelled.slice(0, 2), lifted, changes: changesOf, partEvents };
-console.log(JSON.stringify({ ...result, zooms, openErrors }));
+console.log(JSON.stringify({ ...result, zooms, openErrors, lateScenes }));
 process.exit();

@@ -66,3 +66,8 @@ def test_a_wheel_with_shift_zooms_although_browsers_turn_it_to_the_side(loading:
 
 def test_a_scene_reports_its_error_although_one_that_should_replace_it_has_failed(loading: dict):
     assert loading["openErrors"] == ["second", "first"]
+
+
+def test_a_scene_that_arrives_late_is_shown_if_those_that_the_user_opened_meanwhile_fail(loading: dict):
+    own = {"shown": ["own"], "cancelled": []}
+    assert loading["lateScenes"] == [own, {"shown": ["a"], "cancelled": ["own"]}, own]

@@ -179,3 +179,24 @@ def test_a_file_opened_by_the_user_is_not_replaced_by_a_newer_snapshot(begun, br
         training.show(encode_snapshot(60), 2)
         time.sleep(5)
         assert browser.evaluate(LOADED_COUNT_JS) == 50 and browser.evaluate("document.title") == "other"
+
+
+DROP_STALLED_FILE_JS = """(() => {
+    const start = (controller) => (window.failFile = () => controller.error(new Error("the disk is gone")));
+    const file = Object.assign(new File(["0123"], "other.hyrf"), { stream: () => new ReadableStream({ start }) });
+    const event = new Event("drop", { cancelable: true });
+    dispatchEvent(Object.assign(event, { dataTransfer: { types: ["Files"], files: [file] } }));
+})()"""
+
+
+@pytest.mark.parametrize("begun", [False, True], ids=["before the first step", "after it"])
+def test_newer_snapshots_are_shown_again_after_a_file_that_loaded_long_has_failed(begun: bool, browser: Browser):
+    with open_training_page(browser, *([(encode_snapshot(20), 1)] if begun else [])) as (training, _):
+        wait_until(browser, f"{LOADED_COUNT_JS} === 20" if begun else f"{REMARK_TEXT_JS} !== ''")
+        browser.evaluate(DROP_STALLED_FILE_JS)
+        training.show(encode_snapshot(60), 2)
+        time.sleep(5)  # the page requests the progress meanwhile
+        assert browser.evaluate(LOADED_COUNT_JS) == (20 if begun else False)
+        browser.evaluate("failFile()")
+        wait_until(browser, f"{LOADED_COUNT_JS} === 60")
+        assert browser.evaluate("document.title") == "fern, step 2 of 3,000"

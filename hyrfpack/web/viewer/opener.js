@@ -32,7 +32,7 @@ export class Opener {
     // What is known of the scene that is shown: its title, and whether the page or its address names it, and not the
     // user. If it was opened, also the `name` of its file, and whether the page or its address names the title.
     this.shown = { title, isOwn: true };
-    this.wanted = null; // identifies the scene that was opened last, or the one before if that one has failed
+    this.wanted = null; // the promise of the `open` that was called last, or of the one before if that one has failed
     this.invites = false; // whether nothing names a scene, so that the page asks for one
   }
 
@@ -69,22 +69,29 @@ export class Opener {
 
   // Opens a scene. `fetchFile` returns a promise of {name, stream}. `name` is the scene's title; if it is null, the
   // file's name is.
-  async open(fetchFile, name = null, isOwn = true) {
-    const { wanted: before } = this, own = (this.wanted = {});
+  open(fetchFile, name = null, isOwn = true) {
+    const before = this.wanted;
     dismiss();
     document.body.classList.remove("empty");
-    try {
-      progress(0);
-      const file = await fetchFile();
-      if (own !== this.wanted) return file.stream.cancel?.();
-      const title = name ?? file.name.replace(/\.\w+$/, "");
-      await this.player.open({ ...file, origin: { title, isNamed: name !== null, isOwn, name: file.name } });
-      postToParent("load");
-    } catch (error) {
-      if (own !== this.wanted) return; // another scene was opened meanwhile
-      this.wanted = before; // it may still be loading, and its errors matter again
-      this.invite();
-      throw error;
-    }
+    progress(0);
+    const open = async () => {
+      try {
+        const file = await fetchFile();
+        // A scene that was opened meanwhile replaces this one only if it can be shown.
+        let newest = null;
+        while (own !== this.wanted && newest !== this.wanted) await (newest = this.wanted).catch(() => {});
+        if (own !== this.wanted) return file.stream.cancel?.();
+        const title = name ?? file.name.replace(/\.\w+$/, "");
+        await this.player.open({ ...file, origin: { title, isNamed: name !== null, isOwn, name: file.name } });
+        postToParent("load");
+      } catch (error) {
+        if (own !== this.wanted) return; // another scene was opened meanwhile
+        this.wanted = before; // it may still be loading, and its errors matter again
+        this.invite();
+        throw error;
+      }
+    };
+    const own = (this.wanted = open());
+    return own;
   }
 }

@@ -25,11 +25,12 @@ async function requestProgress(address) {
   }
 }
 
-// Follows a training run until its server stops answering or `isWanted()` is false. `show(progress)` is called for each
-// new snapshot, and its promise is awaited; `waiting()` is called while there is no snapshot.
-async function followTraining(address, { show, waiting, isWanted }) {
+// Follows a training run until its server stops answering or `isFollowed()` is false. `show(progress)` is called for
+// each new snapshot while `isWanted()`, and again if its promise does not resolve to true; `waiting()` is called while
+// there is no snapshot.
+async function followTraining(address, { show, waiting, isFollowed, isWanted }) {
   let shown = 0;
-  for (let failures = 0; isWanted() && failures < MAX_FAILURES; ) {
+  for (let failures = 0; isFollowed() && failures < MAX_FAILURES; ) {
     const progress = document.hidden && shown ? { snapshot: shown } : await requestProgress(address);
     failures = progress ? 0 : failures + 1;
     let loadMs = 0;
@@ -37,8 +38,7 @@ async function followTraining(address, { show, waiting, isWanted }) {
     else if (progress && progress.snapshot !== shown && isWanted()) {
       const began = performance.now();
       try {
-        await show(progress);
-        shown = progress.snapshot;
+        if (await show(progress)) shown = progress.snapshot;
       } catch (error) {
         if (!shown) throw error; // after the first snapshot errors are ignored, because the next one may be valid
       }
@@ -56,27 +56,28 @@ export function watchTraining(opener, address, updates, sceneTitle) {
   const { player, panel } = opener;
   return new Promise((shown, failed) => {
     let own = opener.wanted, isShown = false;
-    const isWanted = () => own === opener.wanted; // until the user opens a file
+    const isFollowed = () => opener.shown.isOwn; // until a file that the user opened is shown
+    const isWanted = () => own === opener.wanted; // false while such a file is loading, which may still fail
     const show = async (training) => {
       const title = trainingTitle(sceneTitle, training);
       if (!isShown) {
         remark("");
-        const opening = opener.open(() => fetchedFile(address), title);
-        own = opener.wanted;
-        await opening;
+        await (own = opener.open(() => fetchedFile(address), title));
         isShown = true;
-        return shown();
+        shown();
+        return true;
       }
       const file = await fetchedFile(address), origin = { ...opener.shown, title };
-      if (!isWanted()) return file.stream.cancel();
-      await player.open({ ...file, update: true, origin });
-      if (!isWanted()) return;
+      if (isWanted()) await player.open({ ...file, update: true, origin });
+      else file.stream.cancel();
+      if (!isWanted()) return false;
       opener.shown = origin;
       panel.setTitle(player.scene, title);
+      return true;
     };
-    const ended = followTraining(updates, { show, waiting: () => remark(NOT_STARTED_TEXT), isWanted });
+    const ended = followTraining(updates, { show, waiting: () => remark(NOT_STARTED_TEXT), isFollowed, isWanted });
     ended.then(() => {
-      if (!isWanted()) return;
+      if (!isFollowed()) return;
       remark(isShown ? TRAINING_ENDED_TEXT : "");
       if (!isShown) failed(new Error(NEVER_STARTED_TEXT));
     }, failed);
