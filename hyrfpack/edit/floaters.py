@@ -20,9 +20,9 @@ from torch import Tensor
 from hyrfpack.data import PictureCache
 from hyrfpack.data.reduced import reduce_view
 from hyrfpack.device import upload
-from hyrfpack.edit.light import measure_light
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import logit
+from hyrfpack.ops.rasterize.light import measure_light
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera, View, evenly_spaced

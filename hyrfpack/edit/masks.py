@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from hyrfpack.edit.light import measure_light
 from hyrfpack.model import HybridModel
+from hyrfpack.ops.rasterize.light import measure_light
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import RenderSettings
 from hyrfpack.scene import View

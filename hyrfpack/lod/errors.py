@@ -15,7 +15,9 @@ from hyrfpack.format.scene_model import join_parts
 from hyrfpack.lod.select import MIN_LEFT_OUT_MSE, project_sphere
 from hyrfpack.model import Decoded, HybridModel
 from hyrfpack.model.merged import MergedModel
-from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
+from hyrfpack.ops.rasterize.light import measure_light
+from hyrfpack.ops.viewport import Viewport
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.render.parts import camera_frame, gather_geometry
@@ -32,7 +34,6 @@ RESOLUTION_RATIOS = ((1.0, 1 / 4), (1 / 2, 1 / 8))
 LIGHT_SHARE_OFFSET = 1e-3
 # If the light of a chunk in all views, at a radius, adds up to less than this, its errors are those of its neighbours.
 MIN_LIGHT_PIXELS = 1.0
-_CHUNKS_PER_RENDER = 3  # the channels of a picture hold the light of one chunk each
 
 
 @torch.no_grad()
@@ -74,24 +75,23 @@ def measure_level_errors(
     for number, camera in enumerate(views):
         progress(TaskEvent(f"measuring levels, view {number + 1}/{len(views)}", number / len(views)))
         in_half = rng.permutation(len(spheres)) % 2 == 0
-        finest = pool.draw(np.zeros(len(spheres), np.int64), camera)
-        errors = []  # for each half and level, the error of each pixel divided by the half's share of its light
-        for half in (in_half, ~in_half):
-            light = pool.draw_shares([half], camera)[..., 0] + LIGHT_SHARE_OFFSET
+        halves = in_half, ~in_half
+        view, finest = pool.open_view(camera), pool.draw(np.zeros(len(spheres), np.int64), camera)
+        # For each half and level, the error of each pixel divided by the half's share of its light.
+        errors = []
+        for half, light_share in zip(halves, view.draw_shares(halves).unbind(dim=-1), strict=True):
             renders = [pool.draw(half * level, camera) for level in range(1, len(levels))]
-            errors.append([(rgb - finest).square().mean(dim=-1) / light for rgb in renders])
-        projections = [project_sphere(center, radius, camera) for center, radius in spheres]
-        visible = [chunk for chunk, (_, area) in enumerate(projections) if area > 0]
-        for first in range(0, len(visible), _CHUNKS_PER_RENDER):
-            drawn = visible[first : first + _CHUNKS_PER_RENDER]
-            shares = pool.draw_shares([np.arange(len(spheres)) == chunk for chunk in drawn], camera)
-            for column, chunk in enumerate(drawn):
-                radius, area = projections[chunk]
+            errors += [(rgb - finest).square().mean(dim=-1) / (light_share + LIGHT_SHARE_OFFSET) for rgb in renders]
+        light = view.measure_chunk_light(torch.stack([torch.ones_like(finest[..., 0]), *errors]), len(spheres))
+        first, second = light[1:].reshape(2, len(levels) - 1, len(spheres))
+        own_errors = np.where(in_half, first, second)
+        for chunk, (center, world_radius) in enumerate(spheres):
+            radius, area = project_sphere(center, world_radius, camera)
+            if area > 0:
                 weights = _node_weights(radius)
                 areas[chunk] += weights * area
-                lights[chunk] += weights * float(shares[..., column].sum())
-                for level, error in enumerate(errors[0 if in_half[chunk] else 1], 1):
-                    sums[level, chunk] += weights * float((error * shares[..., column]).sum())
+                lights[chunk] += weights * light[0, chunk]
+                sums[1:, chunk] += weights * own_errors[:, chunk, None]
     # The sphere of a chunk may cover a picture that shows no Gaussian of it, such as one beside or behind the camera.
     is_visible = lights >= MIN_LIGHT_PIXELS
     return _fill_gaps(sums * is_visible, areas * is_visible)
@@ -130,15 +130,9 @@ class _PooledChunks:
         index = torch.from_numpy(np.flatnonzero(self.level_of == levels[self.chunk_of]))
         return render_view(self.model.subset(index), camera, decoded=self.decoded[index]).rgb
 
-    def draw_shares(self, sets: Sequence[np.ndarray], camera: Camera) -> Tensor:
-        """Return the share (H, W, 3) of each pixel's light of up to three sets (chunks,) bool, at the finest levels."""
-        index = torch.from_numpy(np.flatnonzero(self.level_of == 0))
-        none = np.zeros(len(sets[0]), bool)
-        # A tensor of one element would index an array as an integer does.
-        members = np.stack(
-            [each[self.chunk_of[index.numpy()]] for each in (*sets, none, none)[:_CHUNKS_PER_RENDER]], axis=1
-        )
-        model = self.model
+    def open_view(self, camera: Camera) -> _FinestView:
+        """Return the finest levels of all chunks as a camera sees them."""
+        index, model = torch.from_numpy(np.flatnonzero(self.level_of == 0)), self.model
         if isinstance(model, MergedModel):
             gaussians, frame = gather_geometry(model, camera, index, self.decoded), camera_frame(model, camera)
         else:
@@ -146,7 +140,35 @@ class _PooledChunks:
             gaussians = self.decoded[index].geometry.with_means(model.gaussians.positions[index])
         viewport = frame.local_viewport(camera, gaussians.means.dtype)
         settings = make_raster_settings(model, RenderSettings())
-        return rasterize(gaussians, torch.from_numpy(members).to(gaussians.means), viewport, settings).rgb
+        return _FinestView(gaussians, self.chunk_of[self.level_of == 0], viewport, settings)
+
+
+@dataclass(frozen=True)
+class _FinestView:
+    """The finest levels of all chunks in a view.
+
+    Attributes:
+        gaussians: the N Gaussians, in the units of the viewport.
+        chunk_of: (N,) chunk of each Gaussian.
+        viewport: the camera.
+        settings: settings of the rasteriser.
+    """
+
+    gaussians: Gaussians3D
+    chunk_of: np.ndarray
+    viewport: Viewport
+    settings: RasterSettings
+
+    def draw_shares(self, halves: tuple[np.ndarray, np.ndarray]) -> Tensor:
+        """Return the share (H, W, 2) of each pixel's light of two sets (chunks,) bool of chunks."""
+        first, second = (half[self.chunk_of] for half in halves)
+        colors = torch.from_numpy(np.stack((first, second, np.zeros_like(first)), axis=1)).to(self.gaussians.means)
+        return rasterize(self.gaussians, colors, self.viewport, self.settings).rgb[..., :2]
+
+    def measure_chunk_light(self, weights: Tensor, count: int) -> np.ndarray:
+        """Return the light (k, count) float64 of each chunk, weighted by maps (k, H, W), see `measure_light`."""
+        light = measure_light(self.gaussians, self.viewport, weights, self.settings).double().cpu().numpy()
+        return np.stack([np.bincount(self.chunk_of, row, minlength=count) for row in light])
 
 
 def _node_weights(radius: float) -> np.ndarray:

@@ -62,6 +62,32 @@ def test_chunks_of_two_parts_have_the_errors_of_chunks_of_one(monkeypatch):
     np.testing.assert_allclose(parts, together, rtol=1e-3)
 
 
+@pytest.mark.parametrize("parts", [1, 2])
+@torch.no_grad()
+def test_errors_are_divided_among_chunks_by_their_light(parts: int, monkeypatch):
+    """As if each chunk were drawn by itself, in white among the others in black."""
+    monkeypatch.setattr(errors, "RESOLUTION_RATIOS", ((1.0,),))
+    (camera,) = ring(1, radius=4.0, width=48, height=48)
+    levels, sphere = make_levels(), (Chunk(LOW, HIGH, ()).center, Chunk(LOW, HIGH, ()).radius)
+    fields, numbers = ([levels[0][0]], [0, 0]) if parts == 1 else ([levels[0][0]] * 2, [0, 1])
+
+    measured = measure_level_errors(levels, [sphere] * 2, [camera], fields=fields, parts=numbers)
+
+    pool = errors._PooledChunks.of(levels, fields, numbers)
+    view, finest = pool.open_view(camera), pool.draw(np.zeros(2, np.int64), camera)
+    only_first, only_second = np.array([True, False]), np.array([False, True])
+    light = view.draw_shares((only_first, only_second)).double().numpy()
+    in_half = np.random.default_rng(0).permutation(2) % 2 == 0
+    assert in_half.sum() == 1  # so each chunk is a half
+    radius, area = project_sphere(*sphere, camera)
+    for chunk, own in enumerate((only_first, only_second)):
+        error = (pool.draw(own * 1, camera) - finest).square().mean(dim=-1).double().numpy()
+        share = light[..., chunk]
+        expected = (error * share / (share + errors.LIGHT_SHARE_OFFSET)).sum() / area
+        node = int(np.abs(np.log(np.array(ERROR_RADII) / radius)).argmin())
+        assert measured[1, chunk, node] == pytest.approx(expected, rel=1e-5)
+
+
 def make_distant_levels(offset: float):
     """Return `make_levels` with the second chunk moved along x, and the sphere of each chunk."""
     levels = make_levels()

@@ -7,8 +7,8 @@ import pytest
 import torch
 from scenes import ring, small_model
 
-from hyrfpack.edit.light import measure_light
 from hyrfpack.ops.rasterize import Gaussians3D, rasterize
+from hyrfpack.ops.rasterize.light import measure_light
 from hyrfpack.ops.viewport import Viewport
 from hyrfpack.render import RenderSettings
 
@@ -25,7 +25,7 @@ def cloud_in_view(offset: float = 0.0) -> tuple[Gaussians3D, Viewport]:
     return gaussians, model.config.frame.local_viewport(RING_CAMERA)
 
 
-@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("count", [1, 3, 7])
 def test_light_and_what_passes_all_gaussians_add_up_to_each_weighted_pixel(count):
     gaussians, viewport = cloud_in_view()
     weights = torch.rand(count, *IMAGE_SIZE, generator=torch.Generator().manual_seed(0))

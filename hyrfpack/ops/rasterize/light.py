@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hyrfpack.ops.rasterize import Gaussians3D, RasterSettings, rasterize
+from hyrfpack.ops.rasterize import rasterize
+from hyrfpack.ops.rasterize.inputs import Gaussians3D, RasterSettings
 from hyrfpack.ops.viewport import Viewport
 
 
@@ -18,12 +19,20 @@ def measure_light(gaussians: Gaussians3D, viewport: Viewport, weights: Tensor, s
     Args:
         gaussians: the N Gaussians, in the units of the viewport.
         viewport: the camera.
-        weights: (k, H, W) with k from 1 to 3, maps of the weight of each pixel.
+        weights: (k, H, W) with k >= 1, maps of the weight of each pixel. Three of them take one pass.
         settings: settings of the rasteriser.
 
     Returns:
         (k, N) in pixels, one row for each map.
     """
+    passes = [_measure_light_of_three(gaussians, viewport, maps, settings) for maps in weights.split(3)]
+    return torch.cat(passes)
+
+
+def _measure_light_of_three(
+    gaussians: Gaussians3D, viewport: Viewport, weights: Tensor, settings: RasterSettings
+) -> Tensor:
+    """Return `measure_light` of up to three maps, as many as a picture has channels."""
     colors = torch.zeros_like(gaussians.means, requires_grad=True)
     with torch.enable_grad():
         rgb = rasterize(gaussians, colors, viewport, settings).rgb
