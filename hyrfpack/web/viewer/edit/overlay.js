@@ -14,7 +14,7 @@ const create = (name, attributes, text = "") => {
 
 export class Overlay {
   // `list()` returns what is drawn: {segments: [[from, to]], points, labels: [{at, text}]} in the page's coordinates.
-  // `placed(projection)` is called before with each view that is drawn.
+  // `placed(projection)` is called with each view before it is drawn.
   constructor(player, list, placed) {
     Object.assign(this, { player, list, placed });
     this.svg = element("edit-overlay");
