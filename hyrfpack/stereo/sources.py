@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
 
 import numpy as np
 
@@ -42,20 +41,24 @@ def choose_sources(cameras: Sequence[Camera], points: np.ndarray, seen: Sequence
     centers = [camera.position for camera in cameras]
     scores = np.zeros((len(cameras), len(cameras)))
     is_shown = np.zeros(len(points), bool)  # by the first photo of a pair
-    for first, second in combinations(range(len(cameras)), 2):
-        if second == first + 1:
-            is_shown[:] = False
-            is_shown[shown[first]] = True
-        shared = shown[second][is_shown[shown[second]]]
-        if len(shared) >= MIN_SHARED_POINTS:
-            sampled = shared[:: -(-len(shared) // MAX_MEASURED_POINTS)]
-            angles = _triangulation_angles(points[sampled], centers[first], centers[second])
-            if MIN_ANGLE_DEGREES <= np.median(angles) <= MAX_ANGLE_DEGREES:
-                std = np.where(angles < BEST_ANGLE_DEGREES, SMALLER_ANGLE_STD_DEGREES, LARGER_ANGLE_STD_DEGREES)
-                weights = np.exp(-((angles - BEST_ANGLE_DEGREES) ** 2) / (2 * std**2))
-                scores[first, second] = scores[second, first] = len(shared) * weights.mean()
+    for first in range(len(cameras)):
+        is_shown[:] = False
+        is_shown[shown[first]] = True
+        for second in range(first + 1, len(cameras)):
+            shared = shown[second][is_shown[shown[second]]]
+            if len(shared) >= MIN_SHARED_POINTS:
+                sampled = shared[:: -(-len(shared) // MAX_MEASURED_POINTS)]
+                angles = _triangulation_angles(points[sampled], centers[first], centers[second])
+                if MIN_ANGLE_DEGREES <= np.median(angles) <= MAX_ANGLE_DEGREES:
+                    scores[first, second] = scores[second, first] = len(shared) * _weigh_angles(angles).mean()
     best = np.argsort(-scores, axis=1, kind="stable")[:, :MAX_SOURCES]
     return [[int(index) for index in row if own[index] > 0] for row, own in zip(best, scores, strict=True)]
+
+
+def _weigh_angles(degrees: np.ndarray) -> np.ndarray:
+    """Return the weights (N,) of triangulation angles, 1 at the best one."""
+    std = np.where(degrees < BEST_ANGLE_DEGREES, SMALLER_ANGLE_STD_DEGREES, LARGER_ANGLE_STD_DEGREES)
+    return np.exp(-((degrees - BEST_ANGLE_DEGREES) ** 2) / (2 * std**2))
 
 
 def _triangulation_angles(points: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
