@@ -40,16 +40,23 @@ def name_part(source: Path, name: str) -> str:
     return f"{source}: part '{name}'"
 
 
+def is_shown(number: int, gaussians: int) -> bool:
+    """Return whether a part of a merged file is shown, given its number from 0 and its number of Gaussians.
+
+    Earlier versions wrote parts without Gaussians. Of these, only the first part shows anything: its background.
+    """
+    return number == 0 or gaussians > 0
+
+
 def iterate_parts(source: Path, progress: Progress) -> Iterator[tuple[str, Path, Progress]]:
     """Yield name, file and progress of each part of a merged file. A file lasts until the next one is asked for.
 
-    Empty parts, which earlier versions wrote, show nothing and are left out. The first one shows its background and is
-    kept.
+    Parts that show nothing (`is_shown`) are left out.
     """
     with Container.open(source, SECTION_CONTENTS) as container, tempfile.TemporaryDirectory() as folder:
         models = list[tuple[str, Container]]()
-        for name, part in open_parts(container):
-            if not models or read_metadata(part).gaussians:
+        for number, (name, part) in enumerate(open_parts(container)):
+            if is_shown(number, read_metadata(part).gaussians):
                 models.append((name, part))
             else:
                 _LOG.info(f"{name_part(source, name)} holds no Gaussian and is left out")

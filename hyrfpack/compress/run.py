@@ -11,7 +11,15 @@ from hyrfpack.checks import check_type
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import DEFAULT_PSNR_DROP_DB, default_distortion
 from hyrfpack.compress.limits import EncodedCandidate, encode_within_bytes, encode_within_psnr_drop
-from hyrfpack.compress.merged import MergedPacker, compress_parts, is_merged, iterate_parts, mask_scene_views, name_part
+from hyrfpack.compress.merged import (
+    MergedPacker,
+    compress_parts,
+    is_merged,
+    is_shown,
+    iterate_parts,
+    mask_scene_views,
+    name_part,
+)
 from hyrfpack.compress.packer import Packer
 from hyrfpack.compress.planner import Planner
 from hyrfpack.compress.reference_renders import ReferenceRenders
@@ -187,7 +195,7 @@ def _check_merged_target(source: Path, target_bytes: int) -> None:
     parts = [
         (name, packed_provenance(provenance, model), model.exposure)
         for number, (name, model, provenance) in enumerate(load_parts(source))
-        if len(model) or number == 0  # `iterate_parts` leaves the others out
+        if is_shown(number, len(model))
     ]
     check_target_above(target_bytes, min_merged_file_bytes(parts))
 

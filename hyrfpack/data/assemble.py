@@ -309,7 +309,6 @@ def _apply_orientations(photos: list[PosedPhoto], notes: list[str]) -> list[Pose
 def _panorama_faces(photo: PosedPhoto) -> list[PosedPhoto]:
     """Split a panorama into photos of its six faces: "street.jpg" becomes "street_front.jpg" and so on."""
     size = face_size(photo.header.width)
-    name = photo.name.removesuffix(photo.path.suffix)
     faces = []
     for face in CUBE_FACES:
         pose = photo.camera_from_world.copy()
@@ -318,7 +317,7 @@ def _panorama_faces(photo: PosedPhoto) -> list[PosedPhoto]:
         faces.append(
             replace(
                 photo,
-                name=f"{name}_{face.name}{photo.path.suffix}",
+                name=face.photo_name(photo.name, photo.path.suffix),
                 header=PictureHeader(size, size, False),
                 lens=face_lens(size),
                 camera_from_world=pose,

@@ -50,6 +50,14 @@ class Face:
     name: str
     axes: tuple[tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]]
 
+    def photo_name(self, panorama_name: str, ending: str) -> str:
+        """Return the name of the face's photo: "street_front.jpg" of "street.jpg" with the ending ".jpg"."""
+        return f"{panorama_name.removesuffix(ending)}_{self.name}{ending}"
+
+    def panorama_name(self, photo_name: str, ending: str) -> str:
+        """Return the name of the panorama of a face's photo, the inverse of `photo_name`."""
+        return photo_name.removesuffix(f"_{self.name}{ending}") + ending
+
     @property
     def rotation(self) -> np.ndarray:
         """(3, 3) rotation from the panorama's camera to the face's camera."""

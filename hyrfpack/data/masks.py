@@ -137,11 +137,9 @@ def assign_masks(views: Sequence[View], folder: Path, others: Sequence[View] = (
 
 
 def _photo_name(view: View) -> str:
-    """Return the name of a view's photo; of a face, that of its panorama: "street.jpg" for "street_front.jpg"."""
+    """Return the name of a view's photo; of a face, that of its panorama."""
     load = view.load
-    if not isinstance(load, FaceFile):
-        return view.name
-    return view.name.removesuffix(f"_{load.face.name}{load.path.suffix}") + load.path.suffix
+    return load.face.panorama_name(view.name, load.path.suffix) if isinstance(load, FaceFile) else view.name
 
 
 def _with_mask(load: PhotoFile | FaceFile, mask: Path, orientation: int) -> PhotoFile | FaceFile:

@@ -39,6 +39,11 @@ def _limit_worker_to_one_core() -> None:
     _thread_state.is_worker = True
 
 
+def _available_threads() -> int:
+    """Return the number of threads for tasks: that of the pool, or 1 in one of its threads."""
+    return 1 if getattr(_thread_state, "is_worker", False) else thread_count()
+
+
 @cache
 def _executor(threads: int) -> ThreadPoolExecutor:
     # torch assigns a thread its thread count at the first query, and takes the count that any thread set last. The
@@ -124,8 +129,8 @@ def run_tasks(task: Callable[[int], None], count: int, *, sequential: bool = Fal
     Raises:
         BaseException: the error of the failed task with the lowest index.
     """
-    threads = thread_count()
-    if sequential or count == 1 or threads == 1 or getattr(_thread_state, "is_worker", False):
+    threads = _available_threads()
+    if sequential or count == 1 or threads == 1:
         for index in range(count):
             task(index)
         return
@@ -219,8 +224,8 @@ def iterate_results(
         >>> list(iterate_results(abs, [-2, 3]))
         [2, 3]
     """
-    threads = thread_count()
-    if device.type != "cpu" or threads == 1 or getattr(_thread_state, "is_worker", False):
+    threads = _available_threads()
+    if device.type != "cpu" or threads == 1:
         yield from map(function, items)
         return
     calls: deque[Future[T]] = deque()

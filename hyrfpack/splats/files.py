@@ -117,9 +117,7 @@ def _read_unbundled_sog(folder: Path) -> dict[str, bytes]:
             f"{_format_names(names)}",
             fix=f"name {(splat_names or level_names)[0]} in it" if splat_names or level_names else default_fix,
         )
-    meta = _read_bytes(folder / sog.META_NAME)
-    pictures = {name: _read_bytes(folder / name) for name in sog.picture_names(meta, str(folder))}
-    return {sog.META_NAME: meta, **pictures}
+    return {file.name: _read_bytes(file) for file in list_source_files(folder)}
 
 
 def _may_hold_gaussians(file: Path) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -104,20 +103,6 @@ def test_the_size_of_an_unbundled_sog_counts_its_own_files_only(tmp_path):
     for source in (tmp_path, tmp_path / "meta.json"):
         assert bytes_on_disk(source) == size
         assert sorted(path.name for path in list_source_files(source)) == sorted(files)
-
-
-def test_each_file_of_an_unbundled_sog_is_read_once(tmp_path, monkeypatch):
-    for name, data in sog.encode_files(random_splats()).items():
-        (tmp_path / name).write_bytes(data)
-    read_bytes, names = Path.read_bytes, []
-
-    def record_read(path: Path) -> bytes:
-        names.append(path.name)
-        return read_bytes(path)
-
-    monkeypatch.setattr(Path, "read_bytes", record_read)
-    read_splats(tmp_path)
-    assert sorted(names) == sorted(path.name for path in tmp_path.iterdir())
 
 
 def test_a_file_above_the_size_limit_is_refused_before_it_is_read(tmp_path):

@@ -217,13 +217,17 @@ def test_in_a_frame_the_wheel_scrolls_the_page_until_the_scene_is_clicked(browse
     assert browser.evaluate("scrollY") == 0
 
 
+def open_framed_on_a_phone(browser: Browser, host: Site, address: str, *, height: int = 180) -> str:
+    """Open a tall page on a phone with a player in a frame; return an expression for the frame's window."""
+    frame = f'<iframe src="{address}" style="border: 0; width: 240px; height: {height}px"></iframe>'
+    host.files["/around.html"] = f'<meta name="viewport" content="width=device-width">{TALL_PAGE_HTML}{frame}'.encode()
+    browser.resize(240, 360, phone=True)
+    browser.open(f"{host.address}/around.html")
+    return "document.querySelector('iframe').contentWindow"
+
+
 def test_in_a_frame_a_pinch_zooms_the_page_until_the_scene_is_tapped(one_browser: Browser, host: Site):
-    frame = '<iframe src="index.html?content=cloud.spz" style="border: 0; width: 240px; height: 180px"></iframe>'
-    page = f'<meta name="viewport" content="width=device-width">{TALL_PAGE_HTML}{frame}'
-    host.files["/around.html"] = page.encode()
-    one_browser.resize(240, 360, phone=True)
-    one_browser.open(f"{host.address}/around.html")
-    inside = "document.querySelector('iframe').contentWindow"
+    inside = open_framed_on_a_phone(one_browser, host, "index.html?content=cloud.spz")
     wait_until(one_browser, f"{inside}.hyrfpack?.player?.loaded")
     where = f"JSON.stringify({inside}.hyrfpack.camera())"
     home = one_browser.evaluate(where)
@@ -237,11 +241,7 @@ def test_in_a_frame_a_pinch_zooms_the_page_until_the_scene_is_tapped(one_browser
 
 def test_in_a_frame_a_tap_that_picks_a_point_lets_fingers_move_the_scene(browser: Browser, host: Site):
     host.files["/edit.html"] = encode_player("a title", content="some scene.hyrf", editable=True)
-    frame = '<iframe src="edit.html" style="border: 0; width: 240px; height: 300px"></iframe>'
-    host.files["/around.html"] = f'<meta name="viewport" content="width=device-width">{TALL_PAGE_HTML}{frame}'.encode()
-    browser.resize(240, 360, phone=True)
-    browser.open(f"{host.address}/around.html")
-    inside = "document.querySelector('iframe').contentWindow"
+    inside = open_framed_on_a_phone(browser, host, "edit.html", height=300)
     wait_until(browser, f"{inside}.hyrfpack?.player?.whole")
     browser.evaluate(f"{inside}.hyrfpack.editor.toggle(true), {inside}.hyrfpack.editor.choose('measure')")
     browser.touch("touchStart", (120, 60))
@@ -250,13 +250,7 @@ def test_in_a_frame_a_tap_that_picks_a_point_lets_fingers_move_the_scene(browser
 
 
 def test_in_a_frame_a_touch_scrolls_the_page_until_the_scene_is_tapped(browser: Browser, host: Site):
-    frame = '<iframe src="index.html?content=cloud.spz" style="border: 0; width: 240px; height: 180px"></iframe>'
-    host.files["/around.html"] = (
-        '<meta name="viewport" content="width=device-width">' + TALL_PAGE_HTML + frame
-    ).encode()
-    browser.resize(240, 360, phone=True)
-    browser.open(f"{host.address}/around.html")
-    inside = "document.querySelector('iframe').contentWindow"
+    inside = open_framed_on_a_phone(browser, host, "index.html?content=cloud.spz")
     wait_until(browser, f"{inside}.hyrfpack?.player?.loaded")
     where = f"JSON.stringify({inside}.hyrfpack.camera())"
     home = browser.evaluate(where)
