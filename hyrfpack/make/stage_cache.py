@@ -35,7 +35,7 @@ class Stopped(KeyboardInterrupt):
 
     Attributes:
         stage: name of the interrupted stage, or of the latest one after which the call was interrupted.
-        preview: file with a preview of the unfinished scene; None if there is none.
+        preview: file with the scene so far, a preview or the trained model; None if there is none.
     """
 
     def __init__(self, stage: str, preview: Path | None = None) -> None:

@@ -258,6 +258,8 @@ def run_compression_stage(stage_cache: StageCache, scene: Scene, plan: Plan, con
         try:
             config = CompressConfig(finetune_steps=plan.finetune_steps or None, target_bytes=plan.target_bytes)
             report = compress_model(source, target, config, data=scene, context=context)
+        except KeyboardInterrupt as error:
+            raise Stopped("compression", source) from error
         except HyrfSizeError as error:
             fix = f"ask for {error.min_bytes:,} bytes or more (`target_bytes`)"
             if trained_target_bytes(stage_cache) != plan.target_bytes:

@@ -70,6 +70,8 @@ def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products,
             with pytest.raises(Stopped) as caught:
                 make_scene(posed, tmp_path / "scene.html")
         assert caught.value.stage == stage and not (tmp_path / "scene.html").exists()
+        trained = tmp_path / "scene.work" / "run" / "model.hyrf"
+        assert caught.value.preview == (trained if function == "compress_model" else None)
         assert [
             name for name in STAGE_FUNCTIONS if any(f"{name}: reused from an earlier run" in s for s in caplog.messages)
         ] == done[:-1]
