@@ -50,7 +50,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 from hang_watchdog import HangWatchdog
 from layers import forbid_training_and_processes, layer_of
 from ops.device import needs_triton  # this import asks for Triton, which reads the environment set above
-from property_tests import use_quick_profile
+from property_tests import use_profile
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.evaluate.figures import figure_to_svg
@@ -59,8 +59,7 @@ from hyrfpack.evaluate.figures import figure_to_svg
 def pytest_configure(config: pytest.Config) -> None:
     """End tests that hang. Draw fewer examples of property tests without acceptance tests, as in `make test`."""
     config.pluginmanager.register(HangWatchdog())
-    if "not acceptance" in config.option.markexpr:
-        use_quick_profile()
+    use_profile("quick" if "not acceptance" in config.option.markexpr else "complete")
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import refused, succeeded
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.path import Path as MatplotlibPath
 from scenes import QUIET_CONTEXT
@@ -37,7 +37,6 @@ def count_kept(*actions) -> int:
 # -- inside or outside ------------------------------------------------------------------------------------------------
 
 
-@settings(deadline=None)
 @given(st.integers(3, 40), st.integers(0, 10_000))
 def test_concave_polygons_hold_the_points_that_matplotlib_finds_in_them(corner_count, seed):
     generator = np.random.default_rng(seed)
@@ -81,7 +80,6 @@ def leads_back(a, b, c) -> bool:
     return ux * vy == uy * vx and ux * vx + uy * vy < 0
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=3, max_size=7, unique=True))
 def test_polygons_are_refused_exactly_if_two_of_their_sides_meet(points):
     corners, count = np.array(points, float), len(points)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from forged_files import file_with_most_gaussians
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scenes import small_model
 
@@ -206,7 +206,6 @@ def test_parts_together_may_not_claim_more_than_the_limits_of_one_file(tmp_path)
         minimal_reader.read_parts(path.read_bytes())
 
 
-@settings(deadline=None)
 @given(st.data())
 def test_damaged_bytes_of_a_merged_file_raise_only_format_errors(tmp_path_factory, data):
     place = data.draw(st.integers(0, len(MERGED) - 1))
@@ -218,7 +217,6 @@ def test_damaged_bytes_of_a_merged_file_raise_only_format_errors(tmp_path_factor
         load_merged_model(path)
 
 
-@settings(deadline=None)
 @given(st.integers(0, len(MERGED) - 1))
 def test_a_truncated_merged_file_is_refused(tmp_path_factory, length):
     path = write_file(tmp_path_factory.mktemp("cut"), MERGED[:length])

@@ -12,7 +12,7 @@ import zlib
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hyrfpack.errors import HyrfError, HyrfFormatError
@@ -45,7 +45,6 @@ def test_an_archive_of_any_method_is_read_like_the_folder(tmp_path, method):
     assert len(load_model(archive)) == len(load_model(GOLDEN_SCENE_FOLDER))
 
 
-@settings(deadline=None)
 @given(st.data())
 def test_a_damaged_archive_is_read_or_refused_without_another_exception(archives, tmp_path_factory, data):
     damaged = bytearray(data.draw(st.sampled_from(archives)))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from json_schema import matches
 
@@ -201,7 +201,6 @@ DAMAGING_CHANGES = [
 ]
 
 
-@settings(deadline=None)
 @given(st.sampled_from(DAMAGING_CHANGES), JSON_VALUES)
 def test_any_change_of_a_value_gives_a_valid_manifest_or_a_format_error(change, value):
     manifest, path = change

@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scenes import camera_at
 
@@ -23,7 +23,6 @@ def total(values, levels):
     return sum(each[level] for each, level in zip(values, levels, strict=True))
 
 
-@settings(deadline=None)
 @given(st.lists(ITEM, min_size=1, max_size=5), st.integers(0, 200))
 def test_the_greedy_choice_is_within_its_bound_of_the_best_one(items, limit):
     costs = [[cost for cost, _ in item] for item in items]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from property_tests import examples
 
@@ -77,7 +77,6 @@ def boundary_of_cells(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return corners.astype(float), np.concatenate((np.c_[a, b, c], np.c_[a, c, d]))
 
 
-@settings(deadline=None)
 @given(st.lists(st.booleans(), min_size=27, max_size=27).filter(any))
 def test_cells_that_touch_along_edges_and_corners_are_cut_apart(cells):
     vertices, faces = boundary_of_cells(np.array(cells).reshape(3, 3, 3))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scenes import camera_at
 from scipy.spatial.transform import Rotation
@@ -49,7 +49,6 @@ def angles(normals: np.ndarray, exact: np.ndarray) -> np.ndarray:
 # -- normals from depth -----------------------------------------------------------------------------------------------
 
 
-@settings(deadline=None)
 @given(st.floats(-0.7, 0.7), st.floats(-0.7, 0.7), st.floats(1e-3, 1e6))
 def test_the_normals_of_a_plane_are_exact_up_to_the_border(tilt_x, tilt_y, distance):
     normal = np.array([tilt_x, tilt_y, 1.0]) / np.linalg.norm([tilt_x, tilt_y, 1.0])

@@ -109,7 +109,7 @@ def test_invalid_files_are_refused_with_the_reason(data, words):
     assert str(error.value).startswith("some.ply: ")
 
 
-@settings(max_examples=40, deadline=None, derandomize=True, database=None)
+@settings(max_examples=40, derandomize=True, database=None)
 @given(
     edits=FILE_EDITS,
     length=KEPT_FRACTIONS,

@@ -223,7 +223,7 @@ def test_invalid_files_are_refused_with_the_reason(data, words):
     assert str(error.value).startswith("some.ply: ")
 
 
-@settings(max_examples=50, deadline=None, derandomize=True, database=None)
+@settings(max_examples=50, derandomize=True, database=None)
 @given(
     text=st.booleans(),
     edits=FILE_EDITS,

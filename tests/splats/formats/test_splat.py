@@ -91,7 +91,7 @@ def test_positions_beyond_float32_are_refused():
         splat.encode(splats)
 
 
-@settings(max_examples=40, deadline=None, derandomize=True, database=None)
+@settings(max_examples=40, derandomize=True, database=None)
 @given(st.binary(max_size=100), st.integers(0, 3))
 def test_random_bytes_are_decoded_or_refused(data, records):
     try:

@@ -263,7 +263,7 @@ def test_a_compression_bomb_is_refused_in_little_memory(version):
     assert peak < 2_000_000
 
 
-@settings(max_examples=40, deadline=None, derandomize=True, database=None)
+@settings(max_examples=40, derandomize=True, database=None)
 @given(
     version=st.sampled_from([3, 4]),
     inside=st.booleans(),
