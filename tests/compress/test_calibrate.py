@@ -199,14 +199,26 @@ def test_the_correction_stays_finite_for_constant_errors(ratio):
 
 
 @pytest.mark.parametrize(
-    ("ratio", "part", "converges"), [(0.6, POSITIONS, True), (0.4, POSITIONS, False), (0.6, COLORS, False)]
+    ("ratio", "part", "change"), [(0.6, POSITIONS, 1.0), (0.6, COLORS, 0.6), (0.8, COLORS, 1.0), (1.8, COLORS, 1.8)]
 )
-def test_positions_may_have_half_of_their_predicted_error(ratio, part, converges):
-    """Their steps are powers of two, so a smaller factor may give several times the error."""
+def test_small_corrections_are_not_measured_again(ratio, part, change):
+    """Positions may have half of their predicted error: a smaller factor may give several times the error, because
+    their steps are powers of two."""
+    correction = SensitivityCorrection(Sensitivity(*np.ones((5, 3)), {}), [(part,)])
+    before = correction.candidate()
+    correction.update({(part,): ErrorMeasurement(ratio, 1.0)}, min_error=0.0)
+
+    name = "positions" if part == POSITIONS else "colors"
+    assert not correction.remaining
+    assert getattr(correction.result(), name) == pytest.approx(change * getattr(before, name))
+
+
+@pytest.mark.parametrize(("ratio", "part"), [(0.4, POSITIONS), (0.4, COLORS), (2.5, COLORS)])
+def test_large_corrections_are_measured_again(ratio, part):
     correction = SensitivityCorrection(Sensitivity(*np.ones((5, 3)), {}), [(part,)])
     correction.update({(part,): ErrorMeasurement(ratio, 1.0)}, min_error=0.0)
 
-    assert (not correction.remaining) == converges
+    assert correction.remaining == [(part,)]
 
 
 @pytest.mark.parametrize("part", QUANTIZED_PARTS[1:], ids="".join)
