@@ -24,7 +24,7 @@ PREDICTION_TOLERANCE_RATIO = 1.4
 # error between the two.
 MIN_ERROR_RATIOS: dict[Part, float] = {(POSITIONS,): 0.5}
 MAX_CORRECTION_RATIO = 64.0
-# A factor that is corrected by a smaller ratio than this is not measured again.
+# If measured and predicted error differ by a smaller ratio than this, the corrected factor is not measured again.
 MAX_UNMEASURED_RATIO = 2.0
 # Factors to measure first: medians of those found for trained models of twelve captures.
 TYPICAL_FACTORS: dict[Part, float] = {
@@ -54,8 +54,8 @@ class CorrectionFactor:
         exponent: power of measured over predicted error to multiply by; re-estimated once two factors were measured.
         value: the best factor known, which is measured next unless it has converged.
         low, high: the largest factor measured to be too small, and the smallest measured to be large enough.
-        converged: whether measured over predicted error lies between `min_ratio` and PREDICTION_TOLERANCE_RATIO, or was
-            so near to 1 before the last correction that it needs no further measurement.
+        converged: whether the factor needs no further measurement, because measured over predicted error lies between
+            `min_ratio` and PREDICTION_TOLERANCE_RATIO, or was near 1 before the last correction.
         last: the factor measured last, and its ratio of measured to predicted error; None before the first.
         min_ratio: the lowest ratio of measured to predicted error that counts as converged.
     """
