@@ -44,4 +44,6 @@ def test_a_chromium_that_does_not_start_leaves_no_thread(monkeypatch: pytest.Mon
     monkeypatch.setattr(chromium, "find_program", lambda: "/bin/false")
     with pytest.raises(Exception, match="launch"):
         chromium.Chromium()
+    for thread in set(threading.enumerate()) - set(before):
+        thread.join(timeout=10)  # Threads that wait for a process end a moment after it.
     assert threading.enumerate() == before
