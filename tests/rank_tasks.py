@@ -20,9 +20,9 @@ from hyrfpack.blocks import train_blocks
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.parallel.ranks import Ranks, join_processes
-from hyrfpack.progress import Event, Progress, StepEvent
+from hyrfpack.progress import Event, Progress, StepEvent, TaskEvent
 from hyrfpack.scene import Picture, Scene
-from hyrfpack.train import DensityConfig, TrainConfig, Trainer, gradients, train_model
+from hyrfpack.train import DensityConfig, TrainConfig, Trainer, budget_pilots, decisions, gradients, train_model
 from hyrfpack.train import trainer as trainers
 from hyrfpack.train.distributed import average_gradients, digest
 
@@ -228,6 +228,33 @@ def stop_and_resume(ranks: Ranks, whole: Path, parts: Path, alone: Path) -> dict
     said["there already"] = error_message(lambda: train_run(ranks, whole))
     said["checkpoint stays"] = ranks.run_on_all((parts / "checkpoint.pt").is_file)
     return said
+
+
+def resume_pilots(ranks: Ranks, whole: Path, parts: Path) -> list[int]:
+    """Train one run without a stop, and one that both ranks stop in the second pilot run and then resume.
+
+    Returns:
+        The numbers of the pilot runs that this rank takes in the resumed run.
+    """
+    decisions.MIN_BUDGET_STEPS, budget_pilots.BUDGET_PILOT_STEPS = 10, 6
+    scene, config = ball_scene(views=10, points=60, side=24), TrainConfig(steps=10)
+    train_model(scene, whole, config, context=cpu_context(ranks))
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    def stop_in_second_pilot(event: Event) -> None:
+        if isinstance(event, TaskEvent) and event.task == "budget pilot run 2/2: training" and event.done == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    stopped = train_model(scene, parts, config, context=cpu_context(ranks, stop_in_second_pilot))
+    assert not stopped.complete
+    numbers: list[int] = []
+
+    def number_pilots(event: Event) -> None:
+        if isinstance(event, TaskEvent) and event.task.startswith("budget pilot run"):
+            numbers.append(int(event.task.split()[3].split("/")[0]))
+
+    train_model(scene, parts, config, resume=True, context=cpu_context(ranks, number_pilots))
+    return sorted(set(numbers))
 
 
 def log_lost_checkpoints(ranks: Ranks, checkpoint: Path) -> list[str]:

@@ -189,7 +189,8 @@ def _note_outcome(result: TrainResult, out: Path, blocks: str | None, overwrite:
     if not result.complete and not _is_resumable(out, blocks):
         note("stopped before the first step; run the same command to start again")
     elif not result.complete:
-        note(f"stopped after step {result.step:,}; {resuming(overwrite)} continues from there")
+        place = f"after step {result.step:,}" if result.step else "during the pilot runs"
+        note(f"stopped {place}; {resuming(overwrite)} continues from there")
     if result.model is not None:
         note_rename(out / MODEL_FILE, result.model)
     if result.missing:

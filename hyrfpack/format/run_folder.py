@@ -12,6 +12,8 @@ from hyrfpack.errors import HyrfFormatError
 
 MODEL_FILE = "model.hyrf"
 CHECKPOINT_FILE = "checkpoint.pt"
+# Finished pilot runs, and the checkpoint of the one in progress; see `hyrfpack.train.pilot_journal`.
+PILOTS_FILE, PILOT_CHECKPOINT_FILE = PILOT_FILES = "pilots.json", "pilot.pt"
 METRICS_FILE = "metrics.json"
 BLOCKS_FOLDER = "blocks"  # of a run in blocks, a folder for each block
 BLOCKS_JOURNAL_FILE = f"{BLOCKS_FOLDER}/blocks.json"  # see `hyrfpack.blocks.journal`

@@ -20,7 +20,8 @@ from hyrfpack.train.exposure_pilots import (
     measure_exposure,
 )
 from hyrfpack.train.length_pilots import max_length_pilot_steps, measure_length, pilot_lengths
-from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, PilotScore, PilotsStopped, ScenePilots, pilot_step_cost
+from hyrfpack.train.pilot_journal import PilotJournal, PilotScore
+from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, PilotsStopped, ScenePilots, pilot_step_cost
 from hyrfpack.train.trainer import Trainer
 
 # Shorter runs have no pilots, which would take too large a part of their time.
@@ -113,11 +114,12 @@ def decide(
     progress: Progress = ignore_progress,
     stop: Callable[[], bool] = lambda: False,
     observer: Callable[[Trainer], None] | None = None,
+    journal: PilotJournal | None = None,
 ) -> Decisions | None:
     """Decide by pilot runs what the settings leave open: first exposure compensation, then the budget, then the length.
 
     Args:
-        scene, config, cache, device, progress, stop, observer: see `ScenePilots`.
+        scene, config, cache, device, progress, stop, observer, journal: see `ScenePilots`.
 
     Returns:
         The decisions; None if `stop` ended the pilots.
@@ -126,7 +128,8 @@ def decide(
         HyrfError: as `Trainer.run`; a photo cannot be read.
     """
     decided = without_pilots(config).config
-    pilots = ScenePilots(scene, decided, cache, device, progress, stop, max_pilot_steps(scene, config), observer)
+    max_steps = max_pilot_steps(scene, config)
+    pilots = ScenePilots(scene, decided, cache, device, progress, stop, max_steps, observer, journal)
     reasons: dict[str, str] = {}
     try:
         if measures_exposure(scene, config):

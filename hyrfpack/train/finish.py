@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from hyrfpack.config.train import TrainConfig
-from hyrfpack.format.run_folder import CHECKPOINT_FILE
+from hyrfpack.format.run_folder import CHECKPOINT_FILE, PILOT_FILES
 from hyrfpack.progress import Progress
 from hyrfpack.scene import Scene
 from hyrfpack.train.log import TrainingLog
@@ -50,13 +50,15 @@ def finish_run(
     overwrite: bool,
     owns_checkpoint: bool,
 ) -> TrainResult:
-    """Write the results of a model, remove the checkpoint unless missing results need it, and end the log.
+    """Write the results of a model, remove what a resumed run would need unless they are missing, and end the log.
 
     Args:
         record, scene, out, config, device, progress, overwrite: see `write_results`.
         log: the run's log.
         owns_checkpoint: whether a checkpoint in the folder belongs to this run.
     """
+    for name in PILOT_FILES:  # While the training record is still there, so that nobody resumes from them.
+        remove_if_possible(out / name)
     results = write_results(record, scene, out, config, device, progress, overwrite=overwrite)
     missing = _log_missing(results)
     # Without a training record, only the checkpoint lets a later call complete the results.

@@ -6,8 +6,11 @@ Held-out photos are not used.
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -15,11 +18,15 @@ import torch
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.data.reduced import reduce_view
+from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.evaluate import Evaluation, evaluate_model
 from hyrfpack.progress import Progress, StepEvent, TaskEvent, ignore_progress, items_of_progress
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
+from hyrfpack.train.pilot_journal import PilotJournal, PilotScore, pilot_key
 from hyrfpack.train.setup import budget_for
 from hyrfpack.train.trainer import Trainer
+
+_LOG = logging.getLogger(__name__)
 
 BUDGET_REFERENCE_STEPS = 500  # By default a pilot has the budget of a run of this length.
 MAX_TRAINING_VIEWS = 150  # The shortest pilots have too few steps for more photos.
@@ -36,30 +43,6 @@ SSIM_WEIGHT_DB = 45.0
 
 class PilotsStopped(Exception):
     """Raised if training is asked to stop during pilot runs."""
-
-
-@dataclass(frozen=True)
-class PilotScore:
-    """The scores of one pilot run on the validation photos.
-
-    Attributes:
-        steps, seed: number of steps and random seed of the pilot run.
-        run_steps: number of steps that the user asked for, of the run that the pilot precedes.
-        max_gaussians: Gaussian budget of the run.
-        exposure: whether per-image gains were learnt, and renders exposed by the map fitted to them.
-        psnr, ssim, psnr_corrected: means over the validation photos, see `hyrfpack.Evaluation`.
-        psnr_per_view: PSNR of each validation photo in dB.
-    """
-
-    steps: int
-    run_steps: int
-    seed: int
-    max_gaussians: int
-    exposure: bool
-    psnr: float
-    ssim: float
-    psnr_corrected: float
-    psnr_per_view: list[float] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -98,6 +81,7 @@ class ScenePilots:
         stop: Callable[[], bool] = lambda: False,
         max_steps: float = 0,
         observer: Callable[[Trainer], None] | None = None,
+        journal: PilotJournal | None = None,
     ) -> None:
         """Start without any scores.
 
@@ -110,10 +94,11 @@ class ScenePilots:
             stop: called after each step; True ends the pilots.
             max_steps: most steps that all pilots take; if given, the events of steps have the share of them.
             observer: called after each step with the trainer of the pilot.
+            journal: pilots that are finished already are not run again, and other ones are kept in it.
         """
         self.scene, self.config, self.cache = scene, config, cache
         self._device, self._progress, self._stop, self._max_steps = device, progress, stop, max_steps
-        self._observer = observer
+        self._observer, self._journal = observer, journal or PilotJournal()
         self.scores: list[PilotScore] = []
         self.steps = 0.0
 
@@ -179,19 +164,31 @@ class ScenePilots:
             budget_factor=None,
             target_bytes=None,
         )
+        key = pilot_key(settings, self.config.steps, fold.scene.train, fold.validation)
+        score = self._journal.find(key)
+        if score is None:
+            score = self._train_and_score(name, fold, settings)
+            self._journal.add(key, score)
+        else:
+            self.steps += fold.step_cost * steps
+        self.scores.append(score)
+        return score
+
+    def _train_and_score(self, name: str, fold: Fold, settings: TrainConfig) -> PilotScore:
+        """Train a pilot with these settings, from its checkpoint if there is one, and score it."""
         self._progress(TaskEvent(f"{name}: reading photos"))
-        trainer = Trainer(fold.scene, settings, self.cache, self._device)
-        trainer.kind = "pilot run"
+        checkpoint = self._journal.checkpoint(settings.steps)
+        trainer = self._set_up(fold, settings, checkpoint)
         before = self.steps
 
         def report_step(event: StepEvent) -> None:
             self.steps = before + fold.step_cost * event.step
             share = min(1.0, self.steps / self._max_steps) if self._max_steps else None
-            self._progress(TaskEvent(f"{name}: training", share, event.step, steps))
+            self._progress(TaskEvent(f"{name}: training", share, event.step, settings.steps))
             if self._observer is not None:
                 self._observer(trainer)
 
-        trainer.run(progress=report_step, stop=self._stop)
+        trainer.run(checkpoint=checkpoint, progress=report_step, stop=self._stop)
         if self._stop():
             raise PilotsStopped
         count = len(fold.validation)
@@ -200,19 +197,34 @@ class ScenePilots:
             fold.validation,
             progress=items_of_progress(self._progress, f"{name}: scoring", count),
         )
-        score = PilotScore(
-            steps=steps,
+        return PilotScore(
+            steps=settings.steps,
             run_steps=self.config.steps,
-            seed=seed,
-            max_gaussians=max_gaussians,
-            exposure=exposure,
+            seed=settings.seed,
+            max_gaussians=cast(int, settings.max_gaussians),
+            exposure=cast(bool, settings.exposure),
             psnr=result.psnr,
             ssim=result.ssim,
             psnr_corrected=result.psnr_corrected,
             psnr_per_view=[view.psnr for view in result.views],
         )
-        self.scores.append(score)
-        return score
+
+    def _set_up(self, fold: Fold, settings: TrainConfig, checkpoint: Path | None) -> Trainer:
+        """Return the trainer of a pilot, at the step of its checkpoint if that exists and is of the same pilot."""
+
+        def make_trainer() -> Trainer:
+            trainer = Trainer(fold.scene, settings, self.cache, self._device)
+            trainer.kind = "pilot run"
+            return trainer
+
+        trainer = make_trainer()
+        if checkpoint is not None and checkpoint.is_file():
+            try:
+                trainer.load(checkpoint)
+            except HyrfTrainingError as error:
+                _LOG.info(f"{error.problem}; this pilot run starts from its first step")
+                return make_trainer()
+        return trainer
 
 
 def pilot_step_cost(reduction: int) -> float:

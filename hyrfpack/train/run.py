@@ -18,7 +18,7 @@ from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache
 from hyrfpack.data.cache import memory_bytes
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.format.run_folder import BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE, MODEL_FILE
+from hyrfpack.format.run_folder import BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE, MODEL_FILE, PILOT_FILES
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
@@ -39,6 +39,7 @@ from hyrfpack.train.decisions import (
 )
 from hyrfpack.train.finish import TrainResult, finish_run
 from hyrfpack.train.log import TrainingLog
+from hyrfpack.train.pilot_journal import PilotJournal, has_pilots, read_scores
 from hyrfpack.train.results import RECORD_FILE, TrainingRecord, read_record, save_model
 from hyrfpack.train.setup import check_target
 from hyrfpack.train.stop import catch_stop_signals
@@ -72,7 +73,8 @@ def train_model(
     The folder gets `model.hyrf` (profile raw), `metrics.json`, `curve.png`, `views/` (held-out photos beside their
     renders and error maps) and, while running, `checkpoint.pt`. The first Ctrl-C, SIGTERM or SIGHUP (as when the
     terminal is closed) saves the checkpoint and returns, unless the parent process ignores the signal. Before the first
-    step, during pilot runs, there is nothing to save.
+    step, during pilot runs, the folder has the finished ones in `pilots.json`, and `pilot.pt` is the checkpoint of one
+    of at least 1,000 steps.
 
     If a result other than the model cannot be written, the run does not fail. A later call with the same settings, with
     or without `resume`, completes the results without training again. The same holds after an interruption while
@@ -82,8 +84,8 @@ def train_model(
         scene: the scene, from `hyrfpack.load_scene`.
         out: the run's folder, created if missing.
         config: settings of the run; None for the defaults.
-        resume: resume from the folder's checkpoint, or complete the results of a finished model. The result equals that
-            of an uninterrupted run.
+        resume: resume from the folder's checkpoint or pilot runs, or complete the results of a finished model. The
+            result equals that of an uninterrupted run.
         overwrite: replace an earlier run in the folder. Without it, nothing is replaced. If a file appears at a
             result's name during training, the result gets a free name beside it; `TrainResult.model` has the model's.
         observer: called after each step with the trainer, whose model it may read and must not change; after steps of
@@ -186,6 +188,10 @@ class _Run:
     def _checkpoint(self) -> Path:
         return self.out / CHECKPOINT_FILE
 
+    def _has_checkpoint(self) -> bool:
+        """Return whether the run is resumed from a checkpoint; all ranks must call this."""
+        return self.ranks.broadcast(self.resume and self._checkpoint.is_file())
+
     @property
     def _replaces(self) -> bool:
         """Return whether files in the folder may be replaced."""
@@ -207,7 +213,7 @@ class _Run:
         """Remove files of the run that this one replaces, which would be resumed if this one stopped early."""
         if not self.overwrite or self.resume or not self.ranks.is_main:
             return
-        remove_run_files(self.out / name for name in (RECORD_FILE, BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE))
+        remove_run_files(self.out / name for name in (RECORD_FILE, BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE, *PILOT_FILES))
 
     def _complete(self, record: TrainingRecord) -> TrainResult:
         """Compute and write the missing results of a finished model; only rank 0 does so."""
@@ -225,7 +231,7 @@ class _Run:
 
     def _decide(self) -> Decisions | None:
         """Decide what the settings leave open; None if the pilot runs for it were stopped."""
-        if self.resume:
+        if self._has_checkpoint():
             saved = self.ranks.run_on_all(self._with_saved_decisions)
             return Decisions(self.ranks.broadcast(saved), {}, [])
         measured = {
@@ -238,10 +244,15 @@ class _Run:
         if self.ranks.is_main:
             labels = [CHOICE_LABELS[choice] for choice, is_measured in measured.items() if is_measured]
             _LOG.info(f"pilot runs, scored on validation photos, choose: {', '.join(labels)}")
+        known = self.ranks.broadcast(read_scores(self.out) if self.resume and self.ranks.is_main else {})
+        # With several processes, pilots have no checkpoints: one process would resume from it, and wait for the others.
+        journal = PilotJournal(self.out if self.ranks.is_main else None, known, checkpoints=self.ranks.is_single)
         with catch_stop_signals(self.context.stop) as stop:
             # Every rank runs all pilots, so that no rank waits for another.
             observer = self.observer if self.ranks.is_main else None
-            pilots = partial(decide, self.scene, self.config, self.cache, self.device, self.progress, stop, observer)
+            pilots = partial(
+                decide, self.scene, self.config, self.cache, self.device, self.progress, stop, observer, journal
+            )
             answers = self.ranks.all_gather(self.ranks.run_on_all(pilots))
         return None if None in answers else answers[0]
 
@@ -265,7 +276,7 @@ class _Run:
         for choice, reason in decisions.reasons.items():
             trainer.choices[choice] = "; ".join(filter(None, (trainer.choices.get(choice), reason)))
         trainer.pilots = [dataclasses.asdict(score) for score in decisions.scores]
-        if self.resume:
+        if self._has_checkpoint():
             trainer.load(self._checkpoint)
         return trainer
 
@@ -315,8 +326,8 @@ class _Run:
 
 
 def is_begun(out: Path) -> bool:
-    """Return whether a run in the folder can be resumed, from a checkpoint or from a model with missing results."""
-    return (out / CHECKPOINT_FILE).is_file() or read_record(out) is not None
+    """Return whether a run in the folder can be resumed: pilot runs, a checkpoint, or a model with missing results."""
+    return (out / CHECKPOINT_FILE).is_file() or has_pilots(out) or read_record(out) is not None
 
 
 def resuming(overwrite: bool) -> str:

@@ -272,17 +272,26 @@ def test_interrupted_training_saves_exits_with_1_and_says_how_to_resume(options,
 
 
 @pytest.mark.usefixtures("signals")
-def test_training_interrupted_during_pilot_runs_exits_with_1_and_saves_nothing(data, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("finished", "message"),
+    [
+        (False, "stopped before the first step; run the same command to start again"),
+        (True, "stopped during the pilot runs; the same command with --resume continues from there"),
+    ],
+)
+def test_training_interrupted_during_pilot_runs_exits_with_1(data, tmp_path, monkeypatch, finished, message):
     before = signal.getsignal(signal.SIGINT)
 
     def decide_interrupted(*arguments):
+        if finished:
+            (tmp_path / "pilots.json").write_text('{"version": 1, "scores": {}}')
         signal.raise_signal(signal.SIGINT)
         return decide(*arguments)
 
     monkeypatch.setattr("hyrfpack.train.run.decide", decide_interrupted)
     result = hyrfpack("train", data, "-o", tmp_path, "--steps", 1_000, "--max-gaussians", 200, "--json")
     assert result.exit_code == 1 and json.loads(result.stdout) == {"complete": False, "step": 0}
-    assert "stopped before the first step; run the same command to start again" in result.stderr
+    assert message in result.stderr
     assert not any((tmp_path / name).exists() for name in ("checkpoint.pt", "model.hyrf"))
     assert signal.getsignal(signal.SIGINT) is before
 

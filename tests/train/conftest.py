@@ -27,7 +27,7 @@ def scores(monkeypatch) -> dict:
         def __init__(self, scene, config, cache, device):
             self.model = config
 
-        def run(self, progress, stop):
+        def run(self, checkpoint, progress, stop):
             pass
 
     def evaluate(config, views, progress):

@@ -265,6 +265,14 @@ def test_a_stopped_and_resumed_run_gives_the_bytes_of_the_uninterrupted_one(run_
 
 
 @needs_ranks
+def test_all_ranks_leave_out_the_pilots_that_rank_0_has_finished(tmp_path):
+    ends = run_on_ranks(tasks.resume_pilots, tmp_path / "whole", tmp_path / "parts")
+    assert [end.result[0] for end in ends] == [2, 2]
+    assert read_model_bytes(tmp_path / "parts") == read_model_bytes(tmp_path / "whole")
+    assert not (tmp_path / "parts" / "pilots.json").exists()
+
+
+@needs_ranks
 def test_only_rank_0_writes_and_its_metrics_name_two_processes(run_folder_and_outcomes):
     folder, _ = run_folder_and_outcomes
     assert {path.name for path in (folder / "whole").iterdir()} == {"model.hyrf", "metrics.json", "curve.png", "views"}
