@@ -17,7 +17,7 @@ const scene = new Scene(), camera = new PerspectiveCamera(), controls = new Orbi
 const fit = () => {
   camera.aspect = innerWidth / innerHeight;
   camera.updateProjectionMatrix();
-  renderer.setPixelRatio(devicePixelRatio);
+  renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
   renderer.setSize(innerWidth, innerHeight);
 };
 

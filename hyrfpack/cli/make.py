@@ -97,8 +97,8 @@ def make(
                 context=RunContext(device=torch_device),
             )
     except Stopped as stop:
-        preview_text = f"; the scene so far: {stop.preview}" if stop.preview else ""
-        note(f"stopped in {stop.stage}; the same command resumes{preview_text}")
+        scene_text = f"; the scene so far: {stop.scene}" if stop.scene else ""
+        note(f"stopped in {stop.stage}; the same command resumes{scene_text}")
         click.get_current_context().exit(1)
     note_rename(output, result.output)
     if as_json:

@@ -35,13 +35,13 @@ class Stopped(KeyboardInterrupt):
 
     Attributes:
         stage: name of the interrupted stage, or of the latest one after which the call was interrupted.
-        preview: file with the scene so far, a preview or the trained model; None if there is none.
+        scene: file with the scene so far, a preview or the trained model; None if there is none.
     """
 
-    def __init__(self, stage: str, preview: Path | None = None) -> None:
+    def __init__(self, stage: str, scene: Path | None = None) -> None:
         super().__init__(f"stopped in {stage}")
         self.stage = stage
-        self.preview = preview
+        self.scene = scene
 
 
 class StageCache:
@@ -126,7 +126,7 @@ class StageCache:
         except KeyboardInterrupt as error:
             with suppress(HyrfError):  # on a full disk, too, the user needs to see that the stage was stopped
                 self.state.add_seconds(name, clock.unrecorded_seconds())
-            raise Stopped(name, getattr(error, "preview", None)) from error
+            raise Stopped(name, getattr(error, "scene", None)) from error
         except HyrfError as error:
             self._record_failure(name, clock)
             advice = f"{error.fix}{self._describe_kept_products(name)}"

@@ -120,7 +120,7 @@ def test_an_interrupted_first_look_leaves_nothing_and_the_same_call_resumes(make
     with pytest.raises(Stopped, match="stopped in poses") as stopped:
         make(observer=interrupt)
     work = Path(make().work)
-    assert stopped.value.preview is None and poses[1:] == [photos] and not (work / "first_look").exists()
+    assert stopped.value.scene is None and poses[1:] == [photos] and not (work / "first_look").exists()
 
 
 @pytest.mark.usefixtures("fake_stages")

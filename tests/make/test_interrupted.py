@@ -71,7 +71,7 @@ def test_an_interrupt_in_each_stage_loses_no_work(after, uninterrupted_products,
                 make_scene(posed, tmp_path / "scene.html")
         assert caught.value.stage == stage and not (tmp_path / "scene.html").exists()
         trained = tmp_path / "scene.work" / "run" / "model.hyrf"
-        assert caught.value.preview == (trained if function == "compress_model" else None)
+        assert caught.value.scene == (trained if function == "compress_model" else None)
         assert [
             name for name in STAGE_FUNCTIONS if any(f"{name}: reused from an earlier run" in s for s in caplog.messages)
         ] == done[:-1]
@@ -112,7 +112,7 @@ def test_a_second_interrupt_keeps_the_stage_and_preview_of_the_first(posed, tmp_
     monkeypatch.setattr(run, "exclusive_folder", interrupted_when_closed)
     with pytest.raises(Stopped, match="stopped in training") as stopped:
         make_scene(posed, tmp_path / "scene.html")
-    assert stopped.value.preview == tmp_path / PREVIEW_FILE
+    assert stopped.value.scene == tmp_path / PREVIEW_FILE
 
 
 def test_an_interrupt_after_all_stages_names_the_last_one(posed, tmp_path, monkeypatch):
@@ -304,7 +304,7 @@ def test_interrupted_pilot_runs_leave_no_preview(posed, tmp_path, monkeypatch):
     monkeypatch.setattr(stages, "write_preview", lambda *arguments: pytest.fail("a pilot run was packed"))
     with pytest.raises(Stopped, match="training") as stopped:
         make_scene(posed, tmp_path / "scene.html")
-    assert stopped.value.preview is None
+    assert stopped.value.scene is None
 
 
 def test_a_checkpoint_that_cannot_be_used_comes_with_advice_that_works(posed, tmp_path, monkeypatch):

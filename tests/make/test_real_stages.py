@@ -63,7 +63,7 @@ def test_a_stop_asked_by_the_context_leaves_a_preview(posed, tmp_path):
     context = RunContext(progress=lambda event: details.extend(event.details[:1]), stop=lambda: "step 5/9" in details)
     with pytest.raises(Stopped, match="stopped in training") as stopped:
         make_scene(posed, tmp_path / "scene.html", context=context)
-    assert stopped.value.preview == tmp_path / "scene.work" / "preview.hyrf" and stopped.value.preview.is_file()
+    assert stopped.value.scene == tmp_path / "scene.work" / "preview.hyrf" and stopped.value.scene.is_file()
 
 
 @pytest.mark.acceptance
