@@ -22,7 +22,16 @@ from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.parallel.ranks import Ranks, join_processes
 from hyrfpack.progress import Event, Progress, StepEvent, TaskEvent
 from hyrfpack.scene import Picture, Scene
-from hyrfpack.train import DensityConfig, TrainConfig, Trainer, budget_pilots, decisions, gradients, train_model
+from hyrfpack.train import (
+    DensityConfig,
+    TrainConfig,
+    Trainer,
+    budget_pilots,
+    decisions,
+    gradients,
+    teachers,
+    train_model,
+)  # fmt: skip
 from hyrfpack.train import trainer as trainers
 from hyrfpack.train.distributed import average_gradients, digest
 
@@ -255,6 +264,33 @@ def resume_pilots(ranks: Ranks, whole: Path, parts: Path) -> list[int]:
 
     train_model(scene, parts, config, resume=True, context=cpu_context(ranks, number_pilots))
     return sorted(set(numbers))
+
+
+def resume_teachers(ranks: Ranks, whole: Path, parts: Path) -> list[int]:
+    """Train one run with teachers without a stop, and one that rank 1 stops in the second teacher run, then resume it.
+
+    Returns:
+        The numbers of the teacher runs that the resumed run takes.
+    """
+    teachers.MIN_TAUGHT_STEPS, teachers.TEACHER_STEPS = 12, 8
+    scene, config = six_photo_scene(), dataclasses.replace(SIX_PHOTO_CONFIG, steps=12, virtual_views=True)
+    train_model(scene, whole, config, context=cpu_context(ranks))
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    def stop_in_second_teacher(event: Event) -> None:
+        if isinstance(event, TaskEvent) and event.task == "teacher run 2/3: training" and event.done == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    context = cpu_context(ranks, stop_in_second_teacher if ranks.rank == 1 else None)
+    assert not train_model(scene, parts, config, context=context).complete
+    numbers: list[int] = []
+
+    def number_teachers(event: Event) -> None:
+        if isinstance(event, TaskEvent) and event.task.startswith("teacher run") and event.done == 1:
+            numbers.append(int(event.task.removeprefix("teacher run ")[0]))
+
+    train_model(scene, parts, config, resume=True, context=cpu_context(ranks, number_teachers))
+    return numbers
 
 
 def log_lost_checkpoints(ranks: Ranks, checkpoint: Path) -> list[str]:

@@ -20,7 +20,7 @@ from hyrfpack.blocks.cells import Cells
 from hyrfpack.blocks.plan import BlockPlan
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.format.run_folder import BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE, PILOT_FILES
+from hyrfpack.format.run_folder import BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE, PREPARED_FILES
 from hyrfpack.train.checkpoint import names_and_sizes
 from hyrfpack.train.results import RECORD_FILE
 from hyrfpack.train.run import is_begun as is_run_begun
@@ -61,8 +61,8 @@ class Journal:
     def start(self) -> None:
         """Write the journal of a new run, and remove what would be taken for results of its blocks, or resumed."""
         replaced = self.path.parent.parent  # may hold a run without blocks
-        remove_run_files(replaced / name for name in (CHECKPOINT_FILE, *PILOT_FILES, RECORD_FILE))
-        names = (CHECKPOINT_FILE, *PILOT_FILES, RECORD_FILE, METRICS_FILE, MODEL_FILE)
+        remove_run_files(replaced / name for name in (CHECKPOINT_FILE, *PREPARED_FILES, RECORD_FILE))
+        names = (CHECKPOINT_FILE, *PREPARED_FILES, RECORD_FILE, METRICS_FILE, MODEL_FILE)
         remove_run_files(self.folder(block) / name for block in self.photos for name in names)
         content = {"version": JOURNAL_VERSION, "settings": self.settings, "photos": self.photos}
         content["division"] = self.division

@@ -78,8 +78,13 @@ def sample_windows(cameras: Sequence[Camera], count: int, cells: int, seed: int 
     return Windows(windows, columns, rows)
 
 
-def interpolate_views(cameras: Sequence[Camera], seed: int = 0, indices: Sequence[int] | None = None) -> list[Camera]:
-    """Interpolate between each camera and a neighbour with a similar viewing direction, in a wider picture.
+def interpolate_views(
+    cameras: Sequence[Camera],
+    seed: int = 0,
+    indices: Sequence[int] | None = None,
+    size_ratio: float = INTERPOLATED_VIEW_SIZE_RATIO,
+) -> list[Camera]:
+    """Interpolate between each camera and a neighbour with a similar viewing direction, by default in a wider picture.
 
     Like held-out photos, these views show what lies between the training photos and just outside them. The neighbour is
     drawn from the nearest cameras, and the view lies 25 to 75 % of the way to it.
@@ -88,6 +93,7 @@ def interpolate_views(cameras: Sequence[Camera], seed: int = 0, indices: Sequenc
         cameras: all cameras; neighbours are searched among them.
         seed: random seed for the choice of neighbours and of positions between them.
         indices: cameras to interpolate from; None for all.
+        size_ratio: width and height of a picture, as multiples of those of the camera.
 
     Returns:
         One view for each index. With fewer than two cameras, the cameras themselves.
@@ -111,7 +117,7 @@ def interpolate_views(cameras: Sequence[Camera], seed: int = 0, indices: Sequenc
         pose = np.eye(4)
         pose[:3, :3] = rotation
         pose[:3, 3] = -rotation @ ((1 - share) * positions[index] + share * positions[other])
-        views.append(_widen(dataclasses.replace(camera, camera_from_world=pose)))
+        views.append(_enlarge(dataclasses.replace(camera, camera_from_world=pose), size_ratio))
     return views
 
 
@@ -151,9 +157,8 @@ def divide_view(camera: Camera, columns: int, rows: int) -> list[Camera]:
     ]
 
 
-def _widen(camera: Camera) -> Camera:
+def _enlarge(camera: Camera, ratio: float) -> Camera:
     """Enlarge the picture on all sides at the same focal lengths."""
-    ratio = INTERPOLATED_VIEW_SIZE_RATIO
     width, height = round(ratio * camera.width), round(ratio * camera.height)
     return dataclasses.replace(
         camera,

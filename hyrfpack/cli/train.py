@@ -40,7 +40,9 @@ if TYPE_CHECKING:
     TrainConfig, "steps", "early_stop", "resolution_schedule", "max_gaussians", "target_bytes", "preset", "seed"
 )
 @scene_options
-@settings_options(TrainConfig, "background", "background_color", "exposure", "antialiased", "log2_table_size")
+@settings_options(
+    TrainConfig, "background", "background_color", "exposure", "virtual_views", "antialiased", "log2_table_size"
+)
 @click.option(
     "--blocks",
     metavar="auto|NxM",
@@ -189,7 +191,7 @@ def _note_outcome(result: TrainResult, out: Path, blocks: str | None, overwrite:
     if not result.complete and not _is_resumable(out, blocks):
         note("stopped before the first step; run the same command to start again")
     elif not result.complete:
-        place = f"after step {result.step:,}" if result.step else "during the pilot runs"
+        place = f"after step {result.step:,}" if result.step else "before the first step"
         note(f"stopped {place}; {resuming(overwrite)} continues from there")
     if result.model is not None:
         note_rename(out / MODEL_FILE, result.model)

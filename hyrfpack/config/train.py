@@ -143,6 +143,8 @@ class TrainConfig:
             runs. Default: measured by pilot runs.
         target_bytes: choose the budget so that 'hyrfpack compress' reaches this file size, such as 500kB.
         surface_points: start with points on surfaces that photos show, beside those of the scene, up to the budget.
+        virtual_views: train runs of at least 2,000 steps on up to 30 photos also on virtual views: the mean render of
+            three short runs at viewpoints between the photos.
         log2_table_size: rows per level of the hash grid: 2^B.
         background: train a background sphere. Default: by preset.
         exposure: exposure compensation: learn per-image gains and an exposure map. Default: decided by pilot runs.
@@ -166,6 +168,7 @@ class TrainConfig:
     budget_factor: Annotated[float | None, Range(1e-3, 1e3)] = None
     target_bytes: Annotated[int | None, Range(1, unit="bytes")] = None
     surface_points: bool = True
+    virtual_views: bool = False
     log2_table_size: Annotated[int | None, Range(4, 24, unit="b")] = None
     background: bool | None = None
     exposure: bool | None = None

@@ -12,8 +12,11 @@ from hyrfpack.errors import HyrfFormatError
 
 MODEL_FILE = "model.hyrf"
 CHECKPOINT_FILE = "checkpoint.pt"
-# Finished pilot runs, and the checkpoint of the one in progress; see `hyrfpack.train.pilot_journal`.
-PILOTS_FILE, PILOT_CHECKPOINT_FILE = PILOT_FILES = "pilots.json", "pilot.pt"
+# What runs before the training itself leave for a resumed run: finished pilots, the checkpoint of the one in progress
+# (`hyrfpack.train.pilot_journal`), and teachers (`hyrfpack.train.teachers`).
+PILOTS_FILE, PILOT_CHECKPOINT_FILE = "pilots.json", "pilot.pt"
+TEACHER_FILES = ("teacher-1.hyrf", "teacher-2.hyrf", "teacher-3.hyrf")
+PREPARED_FILES = (PILOTS_FILE, PILOT_CHECKPOINT_FILE, *TEACHER_FILES)
 METRICS_FILE = "metrics.json"
 BLOCKS_FOLDER = "blocks"  # of a run in blocks, a folder for each block
 BLOCKS_JOURNAL_FILE = f"{BLOCKS_FOLDER}/blocks.json"  # see `hyrfpack.blocks.journal`
@@ -54,6 +57,11 @@ class RunStatus:
 def is_run_folder(path: str | os.PathLike[str]) -> bool:
     """Return whether a path is the folder of a training run, finished or not."""
     return any(_has_file(path, name) for name in (MODEL_FILE, CHECKPOINT_FILE))
+
+
+def is_prepared(folder: Path) -> bool:
+    """Return whether a folder holds what runs before the training itself have left, so that the run can be resumed."""
+    return any(_has_file(folder, name) for name in PREPARED_FILES)
 
 
 def find_model(path: str | os.PathLike[str]) -> Path:

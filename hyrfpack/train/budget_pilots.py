@@ -35,7 +35,7 @@ def measure_budget(pilots: ScenePilots, exposure: bool) -> tuple[float, str]:
         The budget as a multiple of the usual one, one of `BUDGET_FACTORS`, and the reason in words.
 
     Raises:
-        PilotsStopped, HyrfError: as `ScenePilots.run`.
+        TrainingStopped, HyrfError: as `ScenePilots.run`.
     """
     fold = pilots.fold()
     if not fold.validation:

@@ -8,11 +8,17 @@ from hyrfpack.config.train import TrainConfig
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError, HyrfTrainingError
 from hyrfpack.evaluate import picture_names
-from hyrfpack.format.run_folder import BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE, PILOT_FILES
+from hyrfpack.format.run_folder import (
+    BLOCKS_JOURNAL_FILE,
+    CHECKPOINT_FILE,
+    METRICS_FILE,
+    MODEL_FILE,
+    PREPARED_FILES,
+    is_prepared,
+)
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.scene import Scene, View
-from hyrfpack.train.pilot_journal import has_pilots
 from hyrfpack.train.pilots import is_usable
 from hyrfpack.train.results import CURVE_FILE, RECORD_FILE, VIEWS_FOLDER, TrainingRecord, changed_settings
 
@@ -27,7 +33,7 @@ def check_folder(
                 f"{out}: the folder holds a model that was trained with other settings ({', '.join(different)})",
                 fix="use the same ones to complete its results, or replace it with `overwrite=True`",
             )
-    elif resume and not ((out / CHECKPOINT_FILE).is_file() or has_pilots(out)):
+    elif resume and not ((out / CHECKPOINT_FILE).is_file() or is_prepared(out)):
         if (out / BLOCKS_JOURNAL_FILE).is_file():
             raise HyrfError(f"{out}: the run in this folder is one in blocks", fix="resume it with the same `blocks`")
         if (out / MODEL_FILE).is_file():
@@ -36,9 +42,11 @@ def check_folder(
                 fix="use this model, or replace it by a new run with `overwrite=True` in place of `resume=True`",
             )
         raise HyrfError(f"{out}: there is no checkpoint to resume", fix="leave out `resume=True` to start a run")
-    left = [name for name in (MODEL_FILE, *PILOT_FILES, CHECKPOINT_FILE, BLOCKS_JOURNAL_FILE) if (out / name).exists()]
+    left = [
+        name for name in (MODEL_FILE, *PREPARED_FILES, CHECKPOINT_FILE, BLOCKS_JOURNAL_FILE) if (out / name).exists()
+    ]
     if left and not (resume or overwrite or record is not None):
-        hint = "`resume=True` continues it, " if {CHECKPOINT_FILE, *PILOT_FILES}.intersection(left) else ""
+        hint = "`resume=True` continues it, " if {CHECKPOINT_FILE, *PREPARED_FILES}.intersection(left) else ""
         raise HyrfError(
             f"{out}: the folder holds an earlier run ({left[-1]})",
             fix=f"{hint}`overwrite=True` replaces it",
@@ -50,7 +58,7 @@ def check_outputs(out: Path, scene: Scene, *, overwrite: bool) -> None:
     """Check that all files of a run may be written."""
     views = [f"{VIEWS_FOLDER}/{name}" for name in picture_names(scene.test).values()]
     Outputs(scene=scene, overwrite=overwrite).folder(
-        out, [MODEL_FILE, CHECKPOINT_FILE, *PILOT_FILES, METRICS_FILE, CURVE_FILE, RECORD_FILE, *views]
+        out, [MODEL_FILE, CHECKPOINT_FILE, *PREPARED_FILES, METRICS_FILE, CURVE_FILE, RECORD_FILE, *views]
     )
 
 

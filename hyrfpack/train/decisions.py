@@ -21,7 +21,8 @@ from hyrfpack.train.exposure_pilots import (
 )
 from hyrfpack.train.length_pilots import max_length_pilot_steps, measure_length, pilot_lengths
 from hyrfpack.train.pilot_journal import PilotJournal, PilotScore
-from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, PilotsStopped, ScenePilots, pilot_step_cost
+from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, ScenePilots, pilot_step_cost
+from hyrfpack.train.stop import TrainingStopped
 from hyrfpack.train.trainer import Trainer
 
 # Shorter runs have no pilots, which would take too large a part of their time.
@@ -141,6 +142,6 @@ def decide(
         if measures_length(scene, config):
             steps, reasons["steps"] = measure_length(pilots, bool(decided.exposure), decided.budget_factor)
             decided = dataclasses.replace(decided, steps=steps)
-    except PilotsStopped:
+    except TrainingStopped:
         return None
     return None if stop() else Decisions(decided, reasons, pilots.scores)

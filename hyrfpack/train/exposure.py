@@ -167,21 +167,31 @@ class Exposures:
     """The gains of each training photo and their Adam state.
 
     Attributes:
-        values: (N, 3) log gains, in the order of the views, with mean zero.
+        values: (N, 3) log gains of the N photos, in their order, with mean zero; with virtual views one more row, which
+            is theirs and stays zero.
     """
 
-    def __init__(self, views: Sequence[View], gains: np.ndarray, device: torch.device) -> None:
-        """Start from `gains`, (N, 3) log gains, less their mean."""
+    def __init__(
+        self, views: Sequence[View], gains: np.ndarray, device: torch.device, virtual: Sequence[View] = ()
+    ) -> None:
+        """Start from `gains`, (N, 3) log gains of the photos, less their mean.
+
+        Args:
+            views: the photos.
+            virtual: views that have the exposure of the model itself.
+        """
         self._row = {view.name: row for row, view in enumerate(views)}
-        self.values = nn.Parameter(torch.from_numpy(gains - gains.mean(0)).float().to(device))
+        self._photos, self._virtual = len(views), {view.name for view in virtual}
+        rows = np.concatenate([gains - gains.mean(0), np.zeros((min(1, len(virtual)), 3))])
+        self.values = nn.Parameter(torch.from_numpy(rows).float().to(device))
         self._exp_avg, self._exp_avg_sq = torch.zeros_like(self.values), torch.zeros_like(self.values)
         self._steps = [0] * len(views)
         self._stepped: list[int] = []  # The rows of the last step.
-        self._rows_on_device = torch.arange(len(views), device=device)
+        self._rows_on_device = torch.arange(len(rows), device=device)
 
     def row(self, view: View) -> Tensor:
-        """Return the row (1,) int64 of a view's photo, on the device."""
-        row = self._row[view.name]
+        """Return the row (1,) int64 of a view, on the device."""
+        row = self._photos if view.name in self._virtual else self._row[view.name]
         return self._rows_on_device[row : row + 1]
 
     def exposed(self, rgb: Tensor, row: Tensor) -> Tensor:
@@ -189,9 +199,9 @@ class Exposures:
         return apply_exposure_gains(rgb, self.values.index_select(0, row)[0].exp())
 
     def fit_map(self, frame: Frame, views: Sequence[View]) -> ExposureFit:
-        """Fit an exposure map to the gains, given the model's frame and the same views as at construction."""
+        """Fit an exposure map to the gains, given the model's frame and the same photos as at construction."""
         poses = [frame.local_pose(view.camera) for view in views]
-        return fit_exposure_map(poses, self.values.detach().cpu().numpy())
+        return fit_exposure_map(poses, self.values[: self._photos].detach().cpu().numpy())
 
     def to_dict(self) -> dict[str, list[float]]:
         """Return the three log gains of each photo, by its name."""
@@ -210,18 +220,23 @@ class Exposures:
             wait for the device.
         """
         assert self.values.grad is not None
-        photos = [self._row[view.name] for view in views]
+        views = list(views)
+        photos = [self._row[view.name] for view in views if view.name not in self._virtual]
         rows = self._stepped = sorted(set(photos))
         for row in rows:
             self._steps[row] += 1
-        decay = GAIN_DECAY / len(photos)  # The gradients are those of the mean loss of all views.
+        if not rows:
+            self.values.grad = None
+            return torch.zeros((), dtype=torch.bool, device=self.values.device)
+        decay = GAIN_DECAY / len(views)  # The gradients are those of the mean loss of all views.
         gradients = [self.values.grad[row] + decay * self.values[row] for row in rows]
         values, *moments = ([tensor[row] for row in rows] for tensor in (self.values, self._exp_avg, self._exp_avg_sq))
         steps = [self._steps[row] for row in rows]
         broken = adam_step(values, gradients, *moments, step=steps, rate=rate, enabled=enabled).any()
         self.values.grad = None
-        mean = self.values.mean(0)
-        self.values.sub_(mean if enabled is None else torch.where(enabled, mean, 0))
+        gains = self.values[: self._photos]
+        mean = gains.mean(0)
+        gains.sub_(mean if enabled is None else torch.where(enabled, mean, 0))
         return broken
 
     def retract_step(self) -> None:
@@ -276,7 +291,12 @@ def _spread_of(observed: Observations, gains: np.ndarray) -> float | None:
 
 
 def initialize_exposures(
-    scene: Scene, config: TrainConfig, cache: PictureCache, device: torch.device, ranks: Ranks = SINGLE_PROCESS
+    scene: Scene,
+    config: TrainConfig,
+    cache: PictureCache,
+    device: torch.device,
+    ranks: Ranks = SINGLE_PROCESS,
+    virtual: Sequence[View] = (),
 ) -> tuple[Exposures | None, str]:
     """Estimate the per-image gains that a run starts from, if `config.exposure` is True.
 
@@ -297,7 +317,7 @@ def initialize_exposures(
             fix="leave out `exposure`",
         )
     gains, reason = ranks.run_on_main(lambda: _initial_gains(scene, cache))
-    return Exposures(scene.train, gains, device), f"per-image gains; {reason}"
+    return Exposures(scene.train, gains, device, virtual), f"per-image gains; {reason}"
 
 
 def _initial_gains(scene: Scene, cache: PictureCache) -> tuple[np.ndarray, str]:

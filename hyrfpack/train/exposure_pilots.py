@@ -74,7 +74,7 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
         Whether to learn per-image gains, and the reason in words.
 
     Raises:
-        PilotsStopped, HyrfError: as `ScenePilots.run`; a photo cannot be read.
+        TrainingStopped, HyrfError: as `ScenePilots.run`; a photo cannot be read.
     """
     spread = estimate_exposure_spread(pilots.scene, pilots.cache)
     if spread is None or spread < MIN_EXPOSURE_SPREAD_STOPS:

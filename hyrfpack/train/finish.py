@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from hyrfpack.config.train import TrainConfig
-from hyrfpack.format.run_folder import CHECKPOINT_FILE, PILOT_FILES
+from hyrfpack.format.run_folder import CHECKPOINT_FILE, PREPARED_FILES
 from hyrfpack.progress import Progress
 from hyrfpack.scene import Scene
 from hyrfpack.train.log import TrainingLog
@@ -57,7 +57,7 @@ def finish_run(
         log: the run's log.
         owns_checkpoint: whether a checkpoint in the folder belongs to this run.
     """
-    for name in PILOT_FILES:  # While the training record is still there, so that nobody resumes from them.
+    for name in PREPARED_FILES:  # While the training record is still there, so that nobody resumes from them.
         remove_if_possible(out / name)
     results = write_results(record, scene, out, config, device, progress, overwrite=overwrite)
     missing = _log_missing(results)

@@ -59,7 +59,7 @@ def measure_length(pilots: ScenePilots, exposure: bool, budget_factor: float | N
         The number of steps and the reason in words.
 
     Raises:
-        PilotsStopped, HyrfError: as `ScenePilots.run`.
+        TrainingStopped, HyrfError: as `ScenePilots.run`.
     """
     lengths = pilot_lengths(pilots.config.steps, len(pilots.scene.train))
     fold = pilots.fold(LENGTH_VALIDATION_EVERY)

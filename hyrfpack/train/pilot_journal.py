@@ -15,7 +15,7 @@ from typing import Any
 from hyrfpack.atomic import write_atomic
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.errors import HyrfError
-from hyrfpack.format.run_folder import PILOT_CHECKPOINT_FILE, PILOT_FILES, PILOTS_FILE
+from hyrfpack.format.run_folder import PILOT_CHECKPOINT_FILE, PILOTS_FILE
 from hyrfpack.scene import View
 from hyrfpack.train.checkpoint import names_and_sizes
 
@@ -89,11 +89,6 @@ class PilotJournal:
             _LOG.warning(f"{error}; training continues, and would repeat this pilot run if it were interrupted")
         with suppress(OSError):
             (self._folder / PILOT_CHECKPOINT_FILE).unlink(missing_ok=True)
-
-
-def has_pilots(folder: Path) -> bool:
-    """Return whether a folder holds pilots of a run that was interrupted, finished ones or one in progress."""
-    return any((folder / name).is_file() for name in PILOT_FILES)
 
 
 def pilot_key(settings: TrainConfig, run_steps: int, training: Sequence[View], validation: Sequence[View]) -> str:

@@ -24,6 +24,7 @@ from hyrfpack.progress import Progress, StepEvent, TaskEvent, ignore_progress, i
 from hyrfpack.scene import Picture, Scene, View, evenly_spaced
 from hyrfpack.train.pilot_journal import PilotJournal, PilotScore, pilot_key
 from hyrfpack.train.setup import budget_for
+from hyrfpack.train.stop import TrainingStopped
 from hyrfpack.train.trainer import Trainer
 
 _LOG = logging.getLogger(__name__)
@@ -39,10 +40,6 @@ MIN_TRAINING_VIEWS = 8  # With fewer photos, none can be spared for validation.
 # One of SSIM counts as much as this many dB of PSNR. In the mean of twelve sets, new versions that raise PSNR by 1 dB
 # raise SSIM by .022.
 SSIM_WEIGHT_DB = 45.0
-
-
-class PilotsStopped(Exception):
-    """Raised if training is asked to stop during pilot runs."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +147,7 @@ class ScenePilots:
             surface_points: as in `TrainConfig`; None takes that of the main run.
 
         Raises:
-            PilotsStopped: `stop` returned True.
+            TrainingStopped: `stop` returned True.
             HyrfError: as `Trainer.run`.
         """
         max_gaussians = max_gaussians or fold.max_gaussians
@@ -190,7 +187,7 @@ class ScenePilots:
 
         trainer.run(checkpoint=checkpoint, progress=report_step, stop=self._stop)
         if self._stop():
-            raise PilotsStopped
+            raise TrainingStopped
         count = len(fold.validation)
         result: Evaluation = evaluate_model(
             trainer.model,

@@ -18,7 +18,13 @@ from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache
 from hyrfpack.data.cache import memory_bytes
 from hyrfpack.errors import HyrfError, HyrfTrainingError
-from hyrfpack.format.run_folder import BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE, MODEL_FILE, PILOT_FILES
+from hyrfpack.format.run_folder import (
+    BLOCKS_JOURNAL_FILE,
+    CHECKPOINT_FILE,
+    MODEL_FILE,
+    PREPARED_FILES,
+    is_prepared,
+)
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
@@ -39,10 +45,11 @@ from hyrfpack.train.decisions import (
 )
 from hyrfpack.train.finish import TrainResult, finish_run
 from hyrfpack.train.log import TrainingLog
-from hyrfpack.train.pilot_journal import PilotJournal, has_pilots, read_scores
+from hyrfpack.train.pilot_journal import PilotJournal, read_scores
 from hyrfpack.train.results import RECORD_FILE, TrainingRecord, read_record, save_model
 from hyrfpack.train.setup import check_target
-from hyrfpack.train.stop import catch_stop_signals
+from hyrfpack.train.stop import TrainingStopped, catch_stop_signals
+from hyrfpack.train.teachers import TeacherRuns, describe_virtual_views
 from hyrfpack.train.trainer import Trainer
 
 __all__ = ["TrainResult", "is_begun", "resuming", "train_model"]
@@ -73,8 +80,8 @@ def train_model(
     The folder gets `model.hyrf` (profile raw), `metrics.json`, `curve.png`, `views/` (held-out photos beside their
     renders and error maps) and, while running, `checkpoint.pt`. The first Ctrl-C, SIGTERM or SIGHUP (as when the
     terminal is closed) saves the checkpoint and returns, unless the parent process ignores the signal. Before the first
-    step, during pilot runs, the folder has the finished ones in `pilots.json`, and `pilot.pt` is the checkpoint of one
-    of at least 1,000 steps.
+    step, the folder keeps finished pilot runs in `pilots.json`, the checkpoint of one of at least 1,000 steps in
+    `pilot.pt`, and finished teacher runs in `teacher-*.hyrf`.
 
     If a result other than the model cannot be written, the run does not fail. A later call with the same settings, with
     or without `resume`, completes the results without training again. The same holds after an interruption while
@@ -182,7 +189,7 @@ class _Run:
             return self._complete(record)
         self.ranks.run_on_all(self._remove_earlier_run)
         decisions = self._decide()
-        return TrainResult(False, 0, None, {}) if decisions is None else self._train(self._set_up(decisions), decisions)
+        return TrainResult(False, 0, None, {}) if decisions is None else self._train(decisions)
 
     @property
     def _checkpoint(self) -> Path:
@@ -213,7 +220,9 @@ class _Run:
         """Remove files of the run that this one replaces, which would be resumed if this one stopped early."""
         if not self.overwrite or self.resume or not self.ranks.is_main:
             return
-        remove_run_files(self.out / name for name in (RECORD_FILE, BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE, *PILOT_FILES))
+        remove_run_files(
+            self.out / name for name in (RECORD_FILE, BLOCKS_JOURNAL_FILE, CHECKPOINT_FILE, *PREPARED_FILES)
+        )
 
     def _complete(self, record: TrainingRecord) -> TrainResult:
         """Compute and write the missing results of a finished model; only rank 0 does so."""
@@ -267,12 +276,25 @@ class _Run:
         steps = chosen_steps(self.scene, config, saved.steps, saved.asked_steps)
         return dataclasses.replace(config, budget_factor=factor, exposure=exposure, steps=steps)
 
-    def _set_up(self, decisions: Decisions) -> Trainer:
-        """Return the trainer, at the step of the checkpoint if the run is resumed."""
+    def _set_up(self, decisions: Decisions) -> Trainer | None:
+        """Return the trainer, at the step of its checkpoint if there is one; None if teacher runs were stopped."""
+        with catch_stop_signals(self.context.stop) as stop:
+            teachers = TeacherRuns(
+                self.scene, decisions.config, self.out, self.resume, self.cache, self.device, self.ranks, self.progress,
+                stop, self.observer if self.ranks.is_main else None,
+            )  # fmt: skip
+            try:
+                virtual = teachers.virtual_views()
+            except TrainingStopped:
+                return None
+            if virtual and any(self.ranks.all_gather(stop())):  # The last teacher was finished nevertheless.
+                return None
         self.progress(TaskEvent("reading photos and setting up the model"))
         trainer = self.ranks.run_on_all(
-            lambda: Trainer(self.scene, decisions.config, self.cache, self.device, ranks=self.ranks)
+            lambda: Trainer(self.scene, decisions.config, self.cache, self.device, ranks=self.ranks, virtual=virtual)
         )
+        if virtual:
+            trainer.choices["virtual_views"] = describe_virtual_views(len(virtual))
         for choice, reason in decisions.reasons.items():
             trainer.choices[choice] = "; ".join(filter(None, (trainer.choices.get(choice), reason)))
         trainer.pilots = [dataclasses.asdict(score) for score in decisions.scores]
@@ -280,8 +302,11 @@ class _Run:
             trainer.load(self._checkpoint)
         return trainer
 
-    def _train(self, trainer: Trainer, decisions: Decisions) -> TrainResult:
+    def _train(self, decisions: Decisions) -> TrainResult:
         """Train, and on rank 0 write the model and the results."""
+        trainer = self._set_up(decisions)
+        if trainer is None:
+            return TrainResult(False, 0, None, {})
         with ExitStack() as stack:
             with _checkpoint_named_in_errors(trainer, self.overwrite):
                 if self.ranks.is_main:
@@ -327,7 +352,7 @@ class _Run:
 
 def is_begun(out: Path) -> bool:
     """Return whether a run in the folder can be resumed: pilot runs, a checkpoint, or a model with missing results."""
-    return (out / CHECKPOINT_FILE).is_file() or has_pilots(out) or read_record(out) is not None
+    return (out / CHECKPOINT_FILE).is_file() or is_prepared(out) or read_record(out) is not None
 
 
 def resuming(overwrite: bool) -> str:

@@ -11,6 +11,10 @@ from contextlib import contextmanager
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
+class TrainingStopped(Exception):
+    """Raised if training is asked to stop in a run before the training itself."""
+
+
 @contextmanager
 def catch_stop_signals(stop: Callable[[], bool] | None = None) -> Iterator[Callable[[], bool]]:
     """Turn the first Ctrl-C, SIGTERM or SIGHUP into a request to stop; a second Ctrl-C or SIGTERM takes effect at once.

@@ -48,6 +48,7 @@ from hyrfpack.version import __version__
 _LOG = logging.getLogger(__name__)
 
 OUT_OF_MEMORY_FIX = "reduce `max_gaussians` or `max_size`"
+VIRTUAL_VIEWS_END = 0.85  # From this share of the run on, steps take photos alone, which are sharper.
 MIN_CURVE_RECORDS = 200  # A run of more steps has up to twice as many records.
 
 
@@ -95,6 +96,7 @@ class Trainer:
         model: HybridModel | None = None,
         strategy: Strategy | None = None,
         ranks: Ranks = SINGLE_PROCESS,
+        virtual: Sequence[View] = (),
     ) -> None:
         """Set up a run.
 
@@ -103,6 +105,8 @@ class Trainer:
                 fields start at lower learning rates (`FIELD_WARMUP_STEPS`).
             strategy: adds and removes Gaussians; None for `DensityControl` with the settings of `config.density`.
             ranks: the processes that train together; each of them sets up the same run.
+            virtual: views that the first 85 % of the steps render in turn with the photos, see
+                `hyrfpack.train.virtual_views`.
 
         Raises:
             HyrfTrainingError: the scene has no training views.
@@ -130,9 +134,12 @@ class Trainer:
             _check_trainable(model)
             self.budget = config.max_gaussians or len(model)
             self.spacing = gaussian_spacing(model, scene.train, usual_budget)
-        self.exposures, self.choices["exposure"] = initialize_exposures(scene, config, self.cache, device, ranks)
+        self.exposures, self.choices["exposure"] = initialize_exposures(
+            scene, config, self.cache, device, ranks, virtual
+        )
+        self._virtual = list(virtual)
         self.renderer = ViewRenderer(
-            scene.train,
+            [*scene.train, *virtual] if virtual else scene.train,
             config,
             self.exposures,
             device,
@@ -238,7 +245,7 @@ class Trainer:
         """Return an iterator over this rank's views of the remaining steps, at the resolutions of these steps."""
         first, count = self.step * self.ranks.size, self.steps * self.ranks.size
         places = range(first + self.ranks.rank, count, self.ranks.size)
-        views = shuffled(self.scene.train, self.config.seed, places)
+        views = self._iterate_views(places)
         return map(self.resolution.reduce_view, views, range(self.step + 1, self.steps + 1))
 
     def _report(self, confirmed: Sequence[ConfirmedStep], progress: Callable[[StepEvent], None]) -> None:
@@ -424,7 +431,15 @@ class Trainer:
     def _views_of_step(self, step: int) -> list[View]:
         """Return the views that all ranks render in a step."""
         places = range((step - 1) * self.ranks.size, step * self.ranks.size)
-        return list(shuffled(self.scene.train, self.config.seed, places))
+        return list(self._iterate_views(places))
+
+    def _iterate_views(self, places: range) -> Iterator[View]:
+        """Yield the views at `places` of the run, counted from 0: the last ones are photos, those before any views."""
+        seed, photos, virtual = self.config.seed, self.scene.train, self._virtual
+        end = int(VIRTUAL_VIEWS_END * self.steps) * self.ranks.size if virtual else 0
+        mixed = range(places.start, max(places.start, min(places.stop, end)), places.step)
+        yield from shuffled([*photos, *virtual], seed, mixed)
+        yield from shuffled(photos, seed, places[len(mixed) :])
 
     def _synchronize(self) -> None:
         """Copy the state of rank 0 to all ranks, if their parameters differ after density control."""
@@ -464,7 +479,7 @@ class Trainer:
     # -- state ---------------------------------------------------------------------------------------------------
 
     def _settings(self) -> dict:
-        views = names_and_sizes(self.scene.train)
+        views = names_and_sizes([*self.scene.train, *self._virtual])
         chosen = {"exposure": self.exposures is not None, "model": self.model.config.to_dict()}
         if not self.ranks.is_single:
             chosen["processes"] = self.ranks.size

@@ -276,7 +276,7 @@ def test_interrupted_training_saves_exits_with_1_and_says_how_to_resume(options,
     ("finished", "message"),
     [
         (False, "stopped before the first step; run the same command to start again"),
-        (True, "stopped during the pilot runs; the same command with --resume continues from there"),
+        (True, "stopped before the first step; the same command with --resume continues from there"),
     ],
 )
 def test_training_interrupted_during_pilot_runs_exits_with_1(data, tmp_path, monkeypatch, finished, message):

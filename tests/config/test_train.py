@@ -31,6 +31,7 @@ INVALID_SETTINGS = {
     "early_stop": (None, 1, "yes"),
     "resolution_schedule": (None, 1, "yes"),
     "surface_points": (None, 1, "yes"),
+    "virtual_views": (None, 1, "yes"),
     "background_color": ("grey", None),
     "antialiased": (None, 1, "yes"),
     "ssim_weight": (1.1, -0.1, *NON_FLOATS),

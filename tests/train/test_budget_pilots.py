@@ -28,7 +28,8 @@ from hyrfpack.train.decisions import (
     max_pilot_steps,
     measures_budget,
 )
-from hyrfpack.train.pilots import PilotsStopped, ScenePilots
+from hyrfpack.train.pilots import ScenePilots
+from hyrfpack.train.stop import TrainingStopped
 
 
 def measure_scene_budget(scene: Scene, config: TrainConfig = LONG_CONFIG, **options) -> tuple[float, str]:
@@ -119,7 +120,7 @@ def test_pilots_stop_when_requested():
     def follow(event: TaskEvent) -> None:
         steps.extend([event] * event.task.endswith("training"))
 
-    with pytest.raises(PilotsStopped):
+    with pytest.raises(TrainingStopped):
         measure_scene_budget(make_scene(), progress=follow, stop=lambda: len(steps) >= 8)
     assert len(steps) == 8
 

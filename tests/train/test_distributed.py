@@ -273,6 +273,15 @@ def test_all_ranks_leave_out_the_pilots_that_rank_0_has_finished(tmp_path):
 
 
 @needs_ranks
+def test_all_ranks_use_the_teachers_that_an_interrupted_run_has_left(tmp_path):
+    ends = run_on_ranks(tasks.resume_teachers, tmp_path / "whole", tmp_path / "parts")
+    assert [end.result for end in ends] == [[2, 3], [2, 3]]
+    assert read_model_bytes(tmp_path / "parts") == read_model_bytes(tmp_path / "whole")
+    assert {path.name for path in (tmp_path / "parts").iterdir()} >= {"model.hyrf", "metrics.json"}
+    assert not list((tmp_path / "parts").glob("teacher-*"))
+
+
+@needs_ranks
 def test_only_rank_0_writes_and_its_metrics_name_two_processes(run_folder_and_outcomes):
     folder, _ = run_folder_and_outcomes
     assert {path.name for path in (folder / "whole").iterdir()} == {"model.hyrf", "metrics.json", "curve.png", "views"}

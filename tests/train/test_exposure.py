@@ -12,6 +12,7 @@ from scenes import alternating_gains, ball_scene, exposed_scene
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.evaluate import evaluate_model
+from hyrfpack.model import Frame
 from hyrfpack.scene import Scene, View
 from hyrfpack.train import TrainConfig, Trainer
 from hyrfpack.train.exposure import (
@@ -157,6 +158,26 @@ def test_steps_are_adam_with_a_pull_to_unit_gains_and_keep_the_mean():
             exposures.values.detach().double(), torch.stack(expected).detach(), rtol=1e-4, atol=1e-6
         )
         assert exposures.values.mean(0).abs().max() < 1e-7
+
+
+def test_virtual_views_keep_the_exposure_of_the_model():
+    *views, virtual = ball_scene(3).train
+    start = np.array([[0.3, -0.2, 0.1], [-0.1, 0.4, 0.0]])
+    alone, exposures = Exposures(views, start, CPU_DEVICE), Exposures(views, start, CPU_DEVICE, [virtual])
+    image = torch.rand(5, 4, 3, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(exposures.exposed(image, exposures.row(virtual)), image)
+
+    (exposures.exposed(image, exposures.row(virtual)) ** 2).mean().backward()
+    assert not exposures.step(0.01, [virtual]) and exposures.values.grad is None
+    for each in (alone, exposures):
+        (each.exposed(image, each.row(views[1])) ** 2).mean().backward()
+        assert not each.step(0.01, [views[1]])
+    assert torch.equal(exposures.values[:2], alone.values) and not exposures.values[2].any()
+    assert exposures.to_dict() == alone.to_dict()
+    frame = Frame((0.0, 0.0, 0.0), 1.0, (1.0, 1.0, 1.0))
+    first, second = (each.fit_map(frame, views) for each in (alone, exposures))
+    assert first.leave_one_out_error == second.leave_one_out_error
+    assert np.array_equal(first.map.weights, second.map.weights)
 
 
 def test_a_gradient_that_is_not_finite_is_reported_and_changes_nothing():

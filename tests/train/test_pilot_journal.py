@@ -20,8 +20,9 @@ from hyrfpack.format.run_folder import CHECKPOINT_FILE, PILOT_CHECKPOINT_FILE, P
 from hyrfpack.progress import Event, TaskEvent
 from hyrfpack.train import TrainConfig, pilot_journal, train_model
 from hyrfpack.train.pilot_journal import PilotJournal, PilotScore, read_scores
-from hyrfpack.train.pilots import PilotsStopped, ScenePilots
+from hyrfpack.train.pilots import ScenePilots
 from hyrfpack.train.run import is_begun
+from hyrfpack.train.stop import TrainingStopped
 
 CONFIG = TrainConfig(steps=10)
 FILES = {PILOTS_FILE, PILOT_CHECKPOINT_FILE, CHECKPOINT_FILE}
@@ -129,7 +130,7 @@ def interrupted_pilots(folder: Path) -> None:
     runs = ScenePilots(
         make_scene(), CONFIG, PictureCache(), CPU_DEVICE, stop=stop, observer=follow, journal=PilotJournal(folder)
     )
-    with pytest.raises(PilotsStopped):
+    with pytest.raises(TrainingStopped):
         runs.run("pilot", runs.fold(), 6, seed=0, exposure=False)
     assert left_files(folder) == {PILOT_CHECKPOINT_FILE}
 
