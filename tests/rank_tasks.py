@@ -31,7 +31,7 @@ from hyrfpack.train import (
     gradients,
     teachers,
     train_model,
-)  # fmt: skip
+)
 from hyrfpack.train import trainer as trainers
 from hyrfpack.train.distributed import average_gradients, digest
 

@@ -96,8 +96,8 @@ def train_model(
         overwrite: replace an earlier run in the folder. Without it, nothing is replaced. If a file appears at a
             result's name during training, the result gets a free name beside it; `TrainResult.model` has the model's.
         observer: called after each step with the trainer, whose model it may read and must not change; after steps of
-            pilot runs, too, whose trainer has the `kind` "pilot run". Of several processes only rank 0 calls it. Its
-            time does not count as training time.
+            pilot and teacher runs, too, whose trainer has the `kind` "pilot run". Of several processes only rank 0
+            calls it. Its time does not count as training time.
         log: a file that gets a line of JSON every few steps, and TensorBoard files beside it if that is installed; see
             `hyrfpack.train.log.TrainingLog`. A resumed run appends to it.
         context: device, processes, progress and stop. A run may be resumed on another device; on a GPU sums of

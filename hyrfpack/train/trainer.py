@@ -78,7 +78,8 @@ class Trainer:
         steps: number of optimiser steps of the whole run.
         spacing: distance between the initial Gaussians in local units, see `gaussian_spacing`.
         learning_rates: those of `config`, adapted to this spacing (`LearningRates.at_spacing`).
-        kind: "pilot run" (`hyrfpack.train.pilots`), "first look" (`hyrfpack.make`), or empty for the run itself.
+        kind: "pilot run" (`hyrfpack.train.pilots`, `hyrfpack.train.teachers`), "first look" (`hyrfpack.make`), or empty
+            for the run itself.
         renderer: renders the training views and computes their gradients.
 
     Example:

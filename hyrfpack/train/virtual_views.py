@@ -20,7 +20,6 @@ from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.scene import Camera, Picture, View
 
 VIRTUAL_VIEW_PREFIX = "virtual/"  # Names of photos are paths with an extension, so none is the name of a virtual view.
-
 MAX_VIRTUAL_VIEW_PIXELS = 1_000_000  # Larger ones would take memory for details that teachers do not have.
 
 
