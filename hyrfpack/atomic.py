@@ -209,6 +209,12 @@ def _move_without_replacing(temporary: Path, target: Path) -> None:
             raise
 
 
+def remove_if_possible(path: Path) -> None:
+    """Remove a file if it exists. One that cannot be removed stays, so that results that are written count."""
+    with contextlib.suppress(OSError):
+        path.unlink(missing_ok=True)
+
+
 def make_folder(path: Path) -> None:
     """Create a folder and its parents.
 

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import torch
 
+from hyrfpack.atomic import remove_if_possible
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, PREPARED_FILES
 from hyrfpack.progress import Progress
 from hyrfpack.scene import Scene
 from hyrfpack.train.log import TrainingLog
-from hyrfpack.train.results import Results, TrainingRecord, read_record, remove_if_possible, write_results
+from hyrfpack.train.results import Results, TrainingRecord, read_record, write_results
 
 _LOG = logging.getLogger(__name__)
 

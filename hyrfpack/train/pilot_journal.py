@@ -7,12 +7,11 @@ import hashlib
 import json
 import logging
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hyrfpack.atomic import write_atomic
+from hyrfpack.atomic import remove_if_possible, write_atomic
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.run_folder import PILOT_CHECKPOINT_FILE, PILOTS_FILE
@@ -87,16 +86,15 @@ class PilotJournal:
             )
         except HyrfError as error:
             _LOG.warning(f"{error}; training continues, and would repeat this pilot run if it were interrupted")
-        with suppress(OSError):
-            (self._folder / PILOT_CHECKPOINT_FILE).unlink(missing_ok=True)
+        remove_if_possible(self._folder / PILOT_CHECKPOINT_FILE)
 
 
-def pilot_key(settings: TrainConfig, run_steps: int, training: Sequence[View], validation: Sequence[View]) -> str:
-    """Return the key of a pilot: a digest of its settings, and of names and sizes of its photos.
+def pilot_key(settings: TrainConfig, run_steps: int, training: Sequence[View], validation: Sequence[View] = ()) -> str:
+    """Return the key of a pilot or teacher run: a digest of its settings, and of names and sizes of its photos.
 
     Args:
-        settings: settings of the pilot.
-        run_steps: number of steps that the user asked for, of the run that the pilot precedes.
+        settings: settings of the pilot or teacher run.
+        run_steps: number of steps of the run that it precedes.
         training, validation: the photos it is trained and scored on.
     """
     inputs = {

@@ -20,7 +20,7 @@ from typing import Any, cast
 import torch
 
 from hyrfpack import format as hyrf_format
-from hyrfpack.atomic import write_atomic
+from hyrfpack.atomic import remove_if_possible, write_atomic
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.device import describe_device
 from hyrfpack.errors import HyrfError, HyrfTrainingError
@@ -309,12 +309,6 @@ def _earlier_pictures(out: Path, scene: Scene) -> list[str]:
         return [picture for picture in pictures if (out / picture).parent.resolve().is_relative_to(folder)]
     except (HyrfError, OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return []
-
-
-def remove_if_possible(path: Path) -> None:
-    """Remove a file if it exists. One that cannot be removed stays, so that results that are written count."""
-    with suppress(OSError):
-        path.unlink(missing_ok=True)
 
 
 @torch.no_grad()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +21,7 @@ from hyrfpack.model import HybridModel
 from hyrfpack.parallel.ranks import Ranks
 from hyrfpack.progress import Progress, StepEvent, TaskEvent
 from hyrfpack.scene import Scene, View
-from hyrfpack.train.checkpoint import names_and_sizes
+from hyrfpack.train.pilot_journal import pilot_key
 from hyrfpack.train.stop import TrainingStopped
 from hyrfpack.train.trainer import Trainer
 from hyrfpack.train.virtual_views import render_virtual_views
@@ -99,7 +97,7 @@ class TeacherRuns:
             steps=TEACHER_STEPS,
             seed=(self.config.seed + 1 + number) % (LARGEST_SEED + 1),  # other ones than that of the run
         )
-        key, path = self._key(settings), self.out / TEACHER_FILES[number]
+        key, path = pilot_key(settings, self.config.steps, self.scene.train), self.out / TEACHER_FILES[number]
         data = self.ranks.broadcast(_read_teacher(path, key) if self.resume and self.ranks.is_main else None)
         if data is None:
             trained = self._train(number, settings)
@@ -125,11 +123,6 @@ class TeacherRuns:
         if not trainer.run(progress=report_step, stop=self.stop):
             raise TrainingStopped
         return trainer.model
-
-    def _key(self, settings: TrainConfig) -> str:
-        """Return a digest of a teacher's settings and photos, by which it is recognised."""
-        inputs = {"settings": settings.to_dict(), "photos": names_and_sizes(self.scene.train)}
-        return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
 
 def _read_teacher(path: Path, key: str) -> bytes | None:

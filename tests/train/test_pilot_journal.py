@@ -24,8 +24,8 @@ from hyrfpack.train.pilots import ScenePilots
 from hyrfpack.train.run import is_begun
 from hyrfpack.train.stop import TrainingStopped
 
-CONFIG = TrainConfig(steps=10)
-FILES = {PILOTS_FILE, PILOT_CHECKPOINT_FILE, CHECKPOINT_FILE}
+TEN_STEP_CONFIG = TrainConfig(steps=10)
+RESUMED_FILES = {PILOTS_FILE, PILOT_CHECKPOINT_FILE, CHECKPOINT_FILE}
 
 
 def interrupt_pilot(number: int, step: int) -> RunContext:
@@ -50,7 +50,7 @@ def follow_pilots(steps: list[tuple[str, int]]) -> RunContext:
 
 
 def left_files(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()} & FILES
+    return {path.name for path in folder.iterdir()} & RESUMED_FILES
 
 
 def assert_same_results(first: Path, second: Path) -> None:
@@ -66,14 +66,14 @@ def assert_same_results(first: Path, second: Path) -> None:
 def test_a_resumed_run_goes_on_in_the_pilot_that_was_interrupted(tmp_path, monkeypatch, has_checkpoints):
     if has_checkpoints:
         monkeypatch.setattr(pilot_journal, "MIN_CHECKPOINT_STEPS", 6)
-    train_model(make_scene(), tmp_path / "whole", CONFIG, context=QUIET_CONTEXT)
+    train_model(make_scene(), tmp_path / "whole", TEN_STEP_CONFIG, context=QUIET_CONTEXT)
     again = tmp_path / "again"
-    assert not train_model(make_scene(), again, CONFIG, context=interrupt_pilot(2, 3)).complete
+    assert not train_model(make_scene(), again, TEN_STEP_CONFIG, context=interrupt_pilot(2, 3)).complete
     assert left_files(again) == ({PILOTS_FILE, PILOT_CHECKPOINT_FILE} if has_checkpoints else {PILOTS_FILE})
     assert is_begun(again)
 
     steps: list[tuple[str, int]] = []
-    assert train_model(make_scene(), again, CONFIG, resume=True, context=follow_pilots(steps)).complete
+    assert train_model(make_scene(), again, TEN_STEP_CONFIG, resume=True, context=follow_pilots(steps)).complete
     assert steps[0] == ("budget pilot run 2/2", 4 if has_checkpoints else 1)
     assert_same_results(tmp_path / "whole", again)
     assert not is_begun(again)
@@ -81,25 +81,25 @@ def test_a_resumed_run_goes_on_in_the_pilot_that_was_interrupted(tmp_path, monke
 
 @pytest.mark.usefixtures("short_pilots", "signals")
 def test_a_run_that_is_interrupted_after_its_pilots_resumes_from_its_checkpoint(tmp_path):
-    train_model(make_scene(), tmp_path / "whole", CONFIG, context=QUIET_CONTEXT)
-    assert train_model(make_scene(), tmp_path / "again", CONFIG, context=interrupt_at(6)).step == 6
+    train_model(make_scene(), tmp_path / "whole", TEN_STEP_CONFIG, context=QUIET_CONTEXT)
+    assert train_model(make_scene(), tmp_path / "again", TEN_STEP_CONFIG, context=interrupt_at(6)).step == 6
     steps: list[tuple[str, int]] = []
-    train_model(make_scene(), tmp_path / "again", CONFIG, resume=True, context=follow_pilots(steps))
+    train_model(make_scene(), tmp_path / "again", TEN_STEP_CONFIG, resume=True, context=follow_pilots(steps))
     assert not steps
     assert_same_results(tmp_path / "whole", tmp_path / "again")
 
 
 @pytest.mark.usefixtures("short_pilots", "signals")
 def test_pilots_are_not_replaced_unless_asked(tmp_path):
-    train_model(make_scene(), tmp_path, CONFIG, context=interrupt_pilot(2, 3))
+    train_model(make_scene(), tmp_path, TEN_STEP_CONFIG, context=interrupt_pilot(2, 3))
     before = (tmp_path / PILOTS_FILE).read_bytes()
     with pytest.raises(HyrfError, match=r"holds an earlier run \(pilots\.json\)") as error:
-        train_model(make_scene(), tmp_path, CONFIG, context=QUIET_CONTEXT)
+        train_model(make_scene(), tmp_path, TEN_STEP_CONFIG, context=QUIET_CONTEXT)
     assert error.value.fix == "`resume=True` continues it, `overwrite=True` replaces it"
     assert (tmp_path / PILOTS_FILE).read_bytes() == before
 
     steps: list[tuple[str, int]] = []
-    assert train_model(make_scene(), tmp_path, CONFIG, overwrite=True, context=follow_pilots(steps)).complete
+    assert train_model(make_scene(), tmp_path, TEN_STEP_CONFIG, overwrite=True, context=follow_pilots(steps)).complete
     assert steps[0] == ("budget pilot run 1/2", 1) and not left_files(tmp_path)
 
 
@@ -110,10 +110,10 @@ def test_pilots_are_not_replaced_unless_asked(tmp_path):
 )
 def test_a_damaged_file_costs_a_repeated_pilot_but_changes_nothing(tmp_path, monkeypatch, name, content):
     monkeypatch.setattr(pilot_journal, "MIN_CHECKPOINT_STEPS", 6)
-    train_model(make_scene(), tmp_path / "whole", CONFIG, context=QUIET_CONTEXT)
-    train_model(make_scene(), tmp_path / "again", CONFIG, context=interrupt_pilot(2, 3))
+    train_model(make_scene(), tmp_path / "whole", TEN_STEP_CONFIG, context=QUIET_CONTEXT)
+    train_model(make_scene(), tmp_path / "again", TEN_STEP_CONFIG, context=interrupt_pilot(2, 3))
     (tmp_path / "again" / name).write_bytes(content)
-    train_model(make_scene(), tmp_path / "again", CONFIG, resume=True, context=QUIET_CONTEXT)
+    train_model(make_scene(), tmp_path / "again", TEN_STEP_CONFIG, resume=True, context=QUIET_CONTEXT)
     assert_same_results(tmp_path / "whole", tmp_path / "again")
 
 
@@ -128,7 +128,13 @@ def interrupted_pilots(folder: Path) -> None:
         count[0] += 1
 
     runs = ScenePilots(
-        make_scene(), CONFIG, PictureCache(), CPU_DEVICE, stop=stop, observer=follow, journal=PilotJournal(folder)
+        make_scene(),
+        TEN_STEP_CONFIG,
+        PictureCache(),
+        CPU_DEVICE,
+        stop=stop,
+        observer=follow,
+        journal=PilotJournal(folder),
     )
     with pytest.raises(TrainingStopped):
         runs.run("pilot", runs.fold(), 6, seed=0, exposure=False)
@@ -141,7 +147,7 @@ def test_a_checkpoint_is_used_only_for_the_pilot_it_belongs_to(tmp_path, monkeyp
     interrupted_pilots(tmp_path)
     steps: list[int] = []
     runs = ScenePilots(
-        make_scene(), CONFIG, PictureCache(), CPU_DEVICE, journal=PilotJournal(tmp_path),
+        make_scene(), TEN_STEP_CONFIG, PictureCache(), CPU_DEVICE, journal=PilotJournal(tmp_path),
         observer=lambda trainer: steps.append(trainer.step),
     )  # fmt: skip
     with caplog.at_level("INFO"):
@@ -154,7 +160,7 @@ def test_a_checkpoint_is_used_only_for_the_pilot_it_belongs_to(tmp_path, monkeyp
 def test_a_known_pilot_is_not_run_and_its_steps_count(tmp_path):
     def run_pilot() -> tuple[PilotScore, ScenePilots]:
         journal = PilotJournal(tmp_path, read_scores(tmp_path))
-        runs = ScenePilots(make_scene(), CONFIG, PictureCache(), CPU_DEVICE, journal=journal)
+        runs = ScenePilots(make_scene(), TEN_STEP_CONFIG, PictureCache(), CPU_DEVICE, journal=journal)
         return runs.run("pilot", runs.fold(reduction=2), 6, seed=0, exposure=False), runs
 
     score, first = run_pilot()
@@ -170,12 +176,12 @@ def test_pilots_with_other_photos_settings_or_steps_of_the_run_are_other_pilots(
         runs = ScenePilots(make_scene(views), config, PictureCache(), CPU_DEVICE, journal=journal)
         runs.run("pilot", runs.fold(), 2, **{"seed": 0, "exposure": False, **settings})
 
-    run_pilot(10, CONFIG)
-    run_pilot(10, CONFIG)
-    run_pilot(11, CONFIG)
+    run_pilot(10, TEN_STEP_CONFIG)
+    run_pilot(10, TEN_STEP_CONFIG)
+    run_pilot(11, TEN_STEP_CONFIG)
     run_pilot(10, TrainConfig(steps=11))
-    run_pilot(10, CONFIG, seed=1)
-    run_pilot(10, CONFIG, max_gaussians=50)
+    run_pilot(10, TEN_STEP_CONFIG, seed=1)
+    run_pilot(10, TEN_STEP_CONFIG, max_gaussians=50)
     assert len(read_scores(tmp_path)) == 5
 
 
@@ -188,7 +194,7 @@ def test_a_score_that_cannot_be_written_is_a_warning(tmp_path, caplog):
     assert "would repeat this pilot run if it were interrupted" in caplog.text
 
 
-SCORE = {
+VALID_SCORE = {
     "steps": 6, "run_steps": 10, "seed": 0, "max_gaussians": 100, "exposure": False, "psnr": 20.0, "ssim": 0.5,
     "psnr_corrected": 20.0, "psnr_per_view": [20.0],
 }  # fmt: skip
@@ -200,17 +206,17 @@ JSON_VALUES = st.recursive(
 
 
 @examples(60)
-@given(field=st.sampled_from([*SCORE, "unknown"]), value=JSON_VALUES, whole=st.booleans())
+@given(field=st.sampled_from([*VALID_SCORE, "unknown"]), value=JSON_VALUES, whole=st.booleans())
 def test_fields_of_other_types_make_the_file_count_as_damaged(tmp_path_factory, field, value, whole):
     folder = tmp_path_factory.mktemp("run")
-    content = value if whole else {"version": 1, "scores": {"key": {**SCORE, field: value}}}
+    content = value if whole else {"version": 1, "scores": {"key": {**VALID_SCORE, field: value}}}
     (folder / PILOTS_FILE).write_text(json.dumps(content))
     for score in read_scores(folder).values():
         assert type(score.steps) is int and type(score.exposure) is bool and isinstance(score.psnr_per_view, list)
 
 
 def test_scores_are_read_as_written(tmp_path):
-    (tmp_path / PILOTS_FILE).write_text(json.dumps({"version": 1, "scores": {"key": SCORE}}))
-    assert read_scores(tmp_path) == {"key": PilotScore(**SCORE)}
-    (tmp_path / PILOTS_FILE).write_text(json.dumps({"version": 2, "scores": {"key": SCORE}}))
+    (tmp_path / PILOTS_FILE).write_text(json.dumps({"version": 1, "scores": {"key": VALID_SCORE}}))
+    assert read_scores(tmp_path) == {"key": PilotScore(**VALID_SCORE)}
+    (tmp_path / PILOTS_FILE).write_text(json.dumps({"version": 2, "scores": {"key": VALID_SCORE}}))
     assert read_scores(tmp_path) == {}

@@ -25,7 +25,7 @@ from hyrfpack.train.run import is_begun
 from hyrfpack.train.teachers import MAX_TAUGHT_PHOTOS, MIN_TAUGHT_STEPS, can_have_teachers
 from hyrfpack.train.virtual_views import render_virtual_views
 
-CONFIG = TrainConfig(steps=10, max_gaussians=60, exposure=False, virtual_views=True)
+TAUGHT_CONFIG = TrainConfig(steps=10, max_gaussians=60, exposure=False, virtual_views=True)
 
 
 @pytest.fixture
@@ -122,7 +122,7 @@ def test_only_long_runs_on_few_photos_have_teachers(photos, steps, expected):
 
 
 def test_a_run_that_cannot_have_virtual_views_says_so(tmp_path, caplog):
-    train_model(make_scene(6), tmp_path, CONFIG, context=QUIET_CONTEXT)
+    train_model(make_scene(6), tmp_path, TAUGHT_CONFIG, context=QUIET_CONTEXT)
     assert (
         "no virtual views: a run has them if it takes 2,000 steps or more on 2 to 30 photos, and this one takes 10 on 6"
         in caplog.messages
@@ -132,7 +132,7 @@ def test_a_run_that_cannot_have_virtual_views_says_so(tmp_path, caplog):
 def test_steps_take_photos_and_virtual_views_in_turn_and_the_last_ones_photos():
     scene = ball_scene(views=4, points=60, side=24)
     virtual = render_virtual_views([teacher()], [view.camera for view in scene.train])
-    trainer = Trainer(scene, dataclasses.replace(CONFIG, steps=30, exposure=True), virtual=virtual)
+    trainer = Trainer(scene, dataclasses.replace(TAUGHT_CONFIG, steps=30, exposure=True), virtual=virtual)
     names = [view.name for step in range(1, 31) for view in trainer._views_of_step(step)]
     photos, every = (sorted(view.name for view in views) for views in (scene.train, [*scene.train, *virtual]))
     assert sorted(names[:8]) == sorted(names[8:16]) == every
@@ -148,8 +148,10 @@ def test_steps_take_photos_and_virtual_views_in_turn_and_the_last_ones_photos():
 @pytest.mark.usefixtures("short_teachers")
 def test_a_run_records_its_virtual_views_and_keeps_no_teachers(tmp_path):
     scene = make_scene(6)
-    train_model(scene, tmp_path / "taught", CONFIG, context=QUIET_CONTEXT)
-    train_model(scene, tmp_path / "alone", dataclasses.replace(CONFIG, virtual_views=False), context=QUIET_CONTEXT)
+    train_model(scene, tmp_path / "taught", TAUGHT_CONFIG, context=QUIET_CONTEXT)
+    train_model(
+        scene, tmp_path / "alone", dataclasses.replace(TAUGHT_CONFIG, virtual_views=False), context=QUIET_CONTEXT
+    )
     taught, alone = (json.loads((tmp_path / name / "metrics.json").read_bytes()) for name in ("taught", "alone"))
     assert taught["choices"]["virtual_views"] == "6, the mean render of 3 runs of 4 steps"
     assert "virtual_views" not in alone["choices"]
@@ -159,43 +161,43 @@ def test_a_run_records_its_virtual_views_and_keeps_no_teachers(tmp_path):
 
 @pytest.mark.usefixtures("short_teachers", "signals")
 def test_a_run_that_is_stopped_in_a_teacher_run_keeps_the_finished_teachers(tmp_path):
-    train_model(make_scene(6), tmp_path / "whole", CONFIG, context=QUIET_CONTEXT)
+    train_model(make_scene(6), tmp_path / "whole", TAUGHT_CONFIG, context=QUIET_CONTEXT)
     again = tmp_path / "again"
-    stopped = train_model(make_scene(6), again, CONFIG, context=interrupt_teacher(2, 2))
+    stopped = train_model(make_scene(6), again, TAUGHT_CONFIG, context=interrupt_teacher(2, 2))
     assert not stopped.complete and left_teachers(again) == ["teacher-1.hyrf"] and is_begun(again)
     numbers: list[int] = []
-    assert train_model(make_scene(6), again, CONFIG, resume=True, context=follow_teachers(numbers)).complete
+    assert train_model(make_scene(6), again, TAUGHT_CONFIG, resume=True, context=follow_teachers(numbers)).complete
     assert numbers == [2, 3] and read_model(again) == read_model(tmp_path / "whole")
 
 
 @pytest.mark.usefixtures("short_teachers", "signals")
 def test_a_stop_in_the_last_step_of_the_last_teacher_run_is_not_forgotten(tmp_path):
-    stopped = train_model(make_scene(6), tmp_path, CONFIG, context=interrupt_teacher(3, 4))
+    stopped = train_model(make_scene(6), tmp_path, TAUGHT_CONFIG, context=interrupt_teacher(3, 4))
     assert (stopped.complete, stopped.step) == (False, 0) and left_teachers(tmp_path) == sorted(TEACHER_FILES)
 
 
 @pytest.mark.usefixtures("short_teachers", "signals")
 @pytest.mark.parametrize("damage", [None, "missing", "damaged"])
 def test_a_run_that_is_stopped_later_has_the_same_virtual_views_when_it_resumes(tmp_path, damage):
-    train_model(make_scene(6), tmp_path / "whole", CONFIG, context=QUIET_CONTEXT)
+    train_model(make_scene(6), tmp_path / "whole", TAUGHT_CONFIG, context=QUIET_CONTEXT)
     again = tmp_path / "again"
-    assert train_model(make_scene(6), again, CONFIG, context=interrupt_at(6)).step == 6
+    assert train_model(make_scene(6), again, TAUGHT_CONFIG, context=interrupt_at(6)).step == 6
     assert left_teachers(again) == sorted(TEACHER_FILES)
     if damage == "missing":
         (again / TEACHER_FILES[1]).unlink()
     elif damage == "damaged":
         (again / TEACHER_FILES[1]).write_bytes(b"no model")
     numbers: list[int] = []
-    train_model(make_scene(6), again, CONFIG, resume=True, context=follow_teachers(numbers))
+    train_model(make_scene(6), again, TAUGHT_CONFIG, resume=True, context=follow_teachers(numbers))
     assert numbers == ([] if damage is None else [2])
     assert read_model(again) == read_model(tmp_path / "whole") and not left_teachers(again)
 
 
 @pytest.mark.usefixtures("short_teachers", "signals")
 def test_teachers_of_other_settings_are_trained_again(tmp_path):
-    train_model(make_scene(6), tmp_path, CONFIG, context=interrupt_teacher(2, 2))
+    train_model(make_scene(6), tmp_path, TAUGHT_CONFIG, context=interrupt_teacher(2, 2))
     numbers: list[int] = []
-    other = dataclasses.replace(CONFIG, max_gaussians=50)
+    other = dataclasses.replace(TAUGHT_CONFIG, max_gaussians=50)
     train_model(make_scene(6), tmp_path, other, resume=True, context=follow_teachers(numbers))
     assert numbers == [1, 2, 3]
 
@@ -206,5 +208,5 @@ def test_a_teacher_that_cannot_be_written_is_a_warning(tmp_path, monkeypatch, ca
         raise HyrfError("the disk is full", fix="free space")
 
     monkeypatch.setattr(teachers, "write_atomic", refuse)
-    assert train_model(make_scene(6), tmp_path, CONFIG, context=QUIET_CONTEXT).complete
+    assert train_model(make_scene(6), tmp_path, TAUGHT_CONFIG, context=QUIET_CONTEXT).complete
     assert caplog.text.count("would repeat this teacher run if it were interrupted") == 3
