@@ -272,8 +272,8 @@ def resume_teachers(ranks: Ranks, whole: Path, parts: Path) -> list[int]:
     Returns:
         The numbers of the teacher runs that the resumed run takes.
     """
-    teachers.MIN_TAUGHT_STEPS, teachers.TEACHER_STEPS = 12, 8
-    scene, config = six_photo_scene(), dataclasses.replace(SIX_PHOTO_CONFIG, steps=12, virtual_views=True)
+    teachers.usual_steps, teachers.TEACHER_STEPS = lambda _: 12, 8
+    scene, config = six_photo_scene(), dataclasses.replace(SIX_PHOTO_CONFIG, steps=12)
     train_model(scene, whole, config, context=cpu_context(ranks))
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 

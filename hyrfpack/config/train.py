@@ -123,7 +123,7 @@ class TrainConfig:
     `budget_factor` exclude each other. Without them, the budget follows from the photos' pixels and the steps;
     `hyrfpack.train_model` also measures the factor before a run of at least 2,000 steps on at least eight photos
     (`hyrfpack.train.budget_pilots`). During the run there may be `DensityConfig.excess` times as many Gaussians. Pilot
-    runs decide `exposure`, too (`hyrfpack.train.exposure_pilots`), and before a run of more than 3,000 steps on 8 to 30
+    runs decide `exposure`, too (`hyrfpack.train.exposure_pilots`), and before a run of at least 6,000 steps on 8 to 30
     photos, or of at least 20,000 on 31 to 100, whether fewer steps are enough (`hyrfpack.train.length_pilots`). A
     `Trainer` by itself makes no pilot runs: it takes all steps, and learns no gains unless `exposure` is True. The hash
     grid whose rows `log2_table_size` states is that of radiance (None: by the budget); the geometry grid has half as
@@ -132,8 +132,8 @@ class TrainConfig:
 
     Attributes:
         steps: training steps.
-        early_stop: shorten a run of over 3,000 steps on 8 to 30 photos, or of 20,000 or more on up to 100, where pilot
-            runs show that more do not help.
+        early_stop: shorten a run of 6,000 steps or more on 8 to 30 photos, or of 20,000 or more on up to 100, where
+            pilot runs show that more do not help.
         resolution_schedule: in the first 80 % of the steps, reduce photos if they are large and Gaussians few, and
             evaluate the background of photos that are not reduced at every third pixel.
         seed: random seed. On a CPU, the same seed gives the same file.
@@ -143,8 +143,8 @@ class TrainConfig:
             runs. Default: measured by pilot runs.
         target_bytes: choose the budget so that 'hyrfpack compress' reaches this file size, such as 500kB.
         surface_points: start with points on surfaces that photos show, beside those of the scene, up to the budget.
-        virtual_views: train runs of at least 2,000 steps on up to 30 photos also on virtual views: the mean render of
-            three short runs at viewpoints between the photos.
+        virtual_views: train runs of at least 3,000 steps (2,000 on photos of 1.7 megapixels) on 2 to 30 photos also
+            on virtual views: the mean render of three short runs at viewpoints between the photos.
         log2_table_size: rows per level of the hash grid: 2^B.
         background: train a background sphere. Default: by preset.
         exposure: exposure compensation: learn per-image gains and an exposure map. Default: decided by pilot runs.
@@ -168,7 +168,7 @@ class TrainConfig:
     budget_factor: Annotated[float | None, Range(1e-3, 1e3)] = None
     target_bytes: Annotated[int | None, Range(1, unit="bytes")] = None
     surface_points: bool = True
-    virtual_views: bool = False
+    virtual_views: bool = True
     log2_table_size: Annotated[int | None, Range(4, 24, unit="b")] = None
     background: bool | None = None
     exposure: bool | None = None

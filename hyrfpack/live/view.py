@@ -28,10 +28,10 @@ MIN_INTERVAL_RATIO = 40.0
 
 
 class LiveView:
-    """Observer that takes snapshots of the model in training, and of the models of pilot runs and of a first look.
+    """Observer that takes snapshots of the models of a training, its pilot and teacher runs, and a first look.
 
     A snapshot is a `.hyrf` file in memory with profile "raw", which is the fastest to write. Snapshots are taken after
-    the very first step and the last step of a run that is no pilot run, and in between at intervals of at least
+    the very first step and the last step of a main run or first look, and in between at intervals of at least
     MIN_INTERVAL_SECONDS and MIN_INTERVAL_RATIO.
     The model is only read, so training with a live view gives the same model, bit by bit, as training without.
 
@@ -65,7 +65,7 @@ class LiveView:
         A model that cannot be written, such as one with non-finite numbers, is skipped: the trainer reports it.
         """
         started = self._clock()
-        is_last = trainer.step == trainer.steps and trainer.kind != "pilot run"
+        is_last = trainer.step == trainer.steps and trainer.kind in ("", "first look")
         if self._count and started < self._next and not is_last:
             return
         if trainer.scene is not self._scene:

@@ -35,6 +35,7 @@ from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from hyrfpack.train.decisions import decide, is_budget_open
 from hyrfpack.train.resolution import PhotoSize
 from hyrfpack.train.setup import budget_for
+from hyrfpack.train.teachers import TEACHER_STEPS, count_teachers
 
 _LOG = logging.getLogger(__name__)
 
@@ -92,11 +93,16 @@ class SceneCost:
         decoding = self.decoding_seconds * min(steps, len(scene.train))
         return TRAINED_PACE_RATIO * steps * step + decoding + estimate_depth_map_seconds(len(scene.train))
 
+    def teacher_seconds(self, scene: Scene, steps: int) -> float:
+        """Estimate the seconds of the teacher runs before a training run with this number of steps."""
+        config = dataclasses.replace(self.requested, steps=steps).train_config(seed=0)
+        teachers = count_teachers(len(scene.train), PhotoSize.of_views(scene.train), config)
+        rendering = len(scene.train) * self._pass_seconds(scene, TEACHER_STEPS) / 2
+        return teachers * (self.training_seconds(scene, TEACHER_STEPS) + rendering)
+
     def seconds_after_training(self, scene: Scene, steps: int) -> dict[str, float]:
         """Estimate the seconds of the work after the last training step, by part of a stage, see `STAGE_PARTS`."""
-        budget = self._budget(scene, steps)
-        at_end, at_probe = (self.step_seconds + self.step_seconds_per_gaussian * n for n in (budget, self.gaussians))
-        pass_seconds = TRAINED_PACE_RATIO * self.cpu_pass_seconds * at_end / at_probe
+        budget, pass_seconds = self._budget(scene, steps), self._pass_seconds(scene, steps)
         scored = PASSES_PER_SCORED_VIEW * len(scene.test)
         return {
             "results": pass_seconds * (BACKGROUND_SEARCH_PASSES + scored) + OVERHEAD_SECONDS / 2,
@@ -106,13 +112,20 @@ class SceneCost:
             "export": OVERHEAD_SECONDS / 2,
         }
 
+    def _pass_seconds(self, scene: Scene, steps: int) -> float:
+        """Estimate the seconds of a pass with the Gaussians of a training run with this number of steps."""
+        budget = self._budget(scene, steps)
+        at_end, at_probe = (self.step_seconds + self.step_seconds_per_gaussian * n for n in (budget, self.gaussians))
+        return TRAINED_PACE_RATIO * self.cpu_pass_seconds * at_end / at_probe
+
     def _budget(self, scene: Scene, steps: int) -> int:
         """Return the budget of a training run with this number of steps."""
         return budget_for(scene, dataclasses.replace(self.requested, steps=steps).train_config(seed=0))[0]
 
     def total_seconds(self, scene: Scene, steps: int) -> float:
-        """Estimate the seconds of training and of everything after it."""
-        return self.training_seconds(scene, steps) + sum(self.seconds_after_training(scene, steps).values())
+        """Estimate the seconds of teacher runs, training and everything after it."""
+        training = self.teacher_seconds(scene, steps) + self.training_seconds(scene, steps)
+        return training + sum(self.seconds_after_training(scene, steps).values())
 
     def max_steps_within(self, scene: Scene, seconds: float) -> int:
         """Return the largest number of steps, at least one, with which everything fits into `seconds`."""
@@ -121,6 +134,17 @@ class SceneCost:
             middle = (low + high + 1) // 2
             low, high = (middle, high) if self.total_seconds(scene, middle) <= seconds else (low, middle - 1)
         return low
+
+    def plan_within(self, scene: Scene, seconds: float) -> Plan:
+        """Return the requested plan with the most steps that fit into `seconds`, at least one.
+
+        If teacher runs leave no time for the usual number of steps, the plan has more steps in their place.
+        """
+        plan = dataclasses.replace(self.requested, steps=self.max_steps_within(scene, seconds))
+        alone = dataclasses.replace(self, requested=dataclasses.replace(self.requested, virtual_views=False))
+        if self.teacher_seconds(scene, plan.steps) or (steps := alone.max_steps_within(scene, seconds)) == plan.steps:
+            return plan
+        return dataclasses.replace(alone.requested, steps=steps)
 
 
 def fit_plan_to_minutes(
@@ -166,8 +190,8 @@ def fit_plan_to_minutes(
     sizes = _candidate_sizes(scene, load_settings.max_size)
     size, cost = _choose_photo_size(sizes, scene_at, measure_cost_at, end)
     chosen_scene = scene_at(size)
-    max_steps = cost.max_steps_within(chosen_scene, end - monotonic())
-    config = dataclasses.replace(requested, steps=max_steps).train_config(seed)
+    requested = cost.plan_within(chosen_scene, end - monotonic())
+    config = requested.train_config(seed)
     decisions = decide(chosen_scene, config, cache, device, part_of_progress(reporter.report_event, 0.6, 1.0))
     assert decisions is not None  # None is only returned if the run is stopped, which nothing does here
     for reason in decisions.reasons.values():
@@ -177,13 +201,15 @@ def fit_plan_to_minutes(
         factor = 1.0  # the decision stays the same if a few more steps fit
     requested = dataclasses.replace(requested, max_size=size, budget_factor=factor, exposure=decisions.config.exposure)
     cost = dataclasses.replace(cost, requested=requested)
-    steps = _choose_steps(cost, chosen_scene, end - monotonic())
+    plan = _choose_steps(cost, chosen_scene, end - monotonic())
+    cost = dataclasses.replace(cost, requested=plan)
     reporter.estimates |= {
         "pilots": 0.0,
-        "training": cost.training_seconds(chosen_scene, steps),
-        **cost.seconds_after_training(chosen_scene, steps),
+        "teachers": cost.teacher_seconds(chosen_scene, plan.steps),
+        "training": cost.training_seconds(chosen_scene, plan.steps),
+        **cost.seconds_after_training(chosen_scene, plan.steps),
     }
-    return dataclasses.replace(requested, steps=steps)
+    return plan
 
 
 def _plan_draft(
@@ -227,20 +253,20 @@ def _choose_photo_size(
     return size, cost if size == probed else measure_cost_at(size, 0.5)
 
 
-def _choose_steps(cost: SceneCost, scene: Scene, remaining: float) -> int:
-    """Return the number of steps that fit into the remaining seconds, at least those of a draft, and log it."""
-    steps = cost.max_steps_within(scene, remaining)
-    if steps < (draft_steps := QUALITIES["draft"].steps):
+def _choose_steps(cost: SceneCost, scene: Scene, remaining: float) -> Plan:
+    """Return the plan that fits into the remaining seconds, with at least the steps of a draft, and log its steps."""
+    plan = cost.plan_within(scene, remaining)
+    if plan.steps < (draft_steps := QUALITIES["draft"].steps):
         _LOG.warning(
             f"the time is short: training a draft of {draft_steps} steps, which takes about "
             f"{cost.total_seconds(scene, draft_steps) / 60:.1f} minutes"
         )
-        return draft_steps
-    note = ", the maximum; the scene will be finished early" if steps == FULL_STEPS else ""
+        return dataclasses.replace(plan, steps=draft_steps)
+    note = ", the maximum; the scene will be finished early" if plan.steps == FULL_STEPS else ""
     _LOG.info(
-        f"{remaining / 60:.1f} minutes are left: {steps:,} steps on photos of {_longest_side(scene)} pixels{note}"
+        f"{remaining / 60:.1f} minutes are left: {plan.steps:,} steps on photos of {_longest_side(scene)} pixels{note}"
     )
-    return steps
+    return plan
 
 
 def measure_scene_cost(

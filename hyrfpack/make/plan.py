@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,8 +23,9 @@ from hyrfpack.train.decisions import (
 from hyrfpack.train.length_pilots import max_length_pilot_steps
 from hyrfpack.train.pilots import BUDGET_REFERENCE_STEPS
 from hyrfpack.train.resolution import PhotoSize
-from hyrfpack.train.setup import budget_for, usual_budget
+from hyrfpack.train.setup import LARGE_PHOTO_STEPS, budget_for, usual_budget, usual_steps
 from hyrfpack.train.surface_depths import MAX_PHOTOS
+from hyrfpack.train.teachers import TEACHER_STEPS, count_teachers
 
 # Measured on two CPU cores, for the first estimate only; during the work, measured times replace it.
 CPU_STEP_SECONDS = 0.03  # time of a training step that does not depend on the photo's size
@@ -39,9 +39,6 @@ DEPTH_MAP_SECONDS_PER_PHOTO = 0.1  # depth maps are as small for large photos as
 # Before a video is decoded, number and size of its photos are unknown.
 ASSUMED_VIDEO_PHOTOS = 100
 ASSUMED_VIDEO_SIZE = (1920, 1080)
-# A run on large photos gets more Gaussians and takes fewer steps, because at equal time that scores higher.
-SMALL_PHOTO_PIXELS = 190_000
-LARGE_PHOTO_PIXELS = 1_700_000
 
 
 @dataclass(frozen=True)
@@ -49,8 +46,7 @@ class Quality:
     """Settings of one of the qualities that can be requested.
 
     Attributes:
-        steps: training steps on a CPU, on photos of at most `SMALL_PHOTO_PIXELS`.
-        large_photo_steps: training steps on a CPU, on photos of `LARGE_PHOTO_PIXELS` or more.
+        steps, large_photo_steps: training steps on a CPU, on small and on large photos (`usual_steps`).
         gpu_steps: training steps on a GPU.
         max_size: longer side in pixels to which larger photos are shrunk.
         finetune_steps: fine-tuning steps during packing.
@@ -65,11 +61,8 @@ class Quality:
     import_psnr: float
 
     def training_steps(self, pixels: float, device: torch.device) -> int:
-        """Return the training steps on photos of `pixels` pixels, by a power law between the two sizes."""
-        if device.type != "cpu":
-            return self.gpu_steps
-        exponent = math.log(pixels / SMALL_PHOTO_PIXELS) / math.log(LARGE_PHOTO_PIXELS / SMALL_PHOTO_PIXELS)
-        return round(self.steps * (self.large_photo_steps / self.steps) ** min(max(exponent, 0.0), 1.0))
+        """Return the training steps on photos of `pixels` pixels."""
+        return usual_steps(pixels, self.steps, self.large_photo_steps) if device.type == "cpu" else self.gpu_steps
 
 
 QUALITIES = {
@@ -78,7 +71,7 @@ QUALITIES = {
     ),
     "normal": Quality(
         steps=TrainConfig.steps,
-        large_photo_steps=2_000,
+        large_photo_steps=LARGE_PHOTO_STEPS,
         gpu_steps=TrainConfig.steps,
         max_size=DEFAULT_MAX_SIZE,
         finetune_steps=0,
@@ -109,7 +102,7 @@ class Plan:
         max_size: maximum size of the photos, see `load_scene`.
         finetune_steps: fine-tuning steps during packing.
         target_bytes: maximum size of the packed model in bytes; None for no limit.
-        max_gaussians, preset, budget_factor, exposure, early_stop: see `TrainConfig`.
+        max_gaussians, preset, budget_factor, exposure, early_stop, virtual_views: see `TrainConfig`.
     """
 
     steps: int
@@ -121,6 +114,7 @@ class Plan:
     budget_factor: float | None = None
     exposure: bool | None = None
     early_stop: bool = True
+    virtual_views: bool = True
 
     def train_config(self, seed: int) -> TrainConfig:
         """Return the training settings of the plan."""
@@ -133,6 +127,7 @@ class Plan:
             budget_factor=self.budget_factor,
             exposure=self.exposure,
             early_stop=self.early_stop,
+            virtual_views=self.virtual_views,
         )
 
     def with_target_bytes(self, target_bytes: int | None) -> Plan:
@@ -163,6 +158,7 @@ def estimate_seconds(
     held_out: int,
     pilot_steps: float,
     device: torch.device,
+    teacher_gaussians: int,
 ) -> dict[str, float]:
     """Estimate roughly how many seconds the stages after the poses take.
 
@@ -174,6 +170,7 @@ def estimate_seconds(
         held_out: number of photos that are scored.
         pilot_steps: number of steps of all pilot runs, see `max_pilot_steps`.
         device: device of the training.
+        teacher_gaussians: expected number of Gaussians of teacher runs, which only a run on few photos has.
 
     Returns:
         Seconds by part of a stage (`hyrfpack.make.progress.STAGE_PARTS`) or by stage.
@@ -185,13 +182,17 @@ def estimate_seconds(
         else (0.0, GPU_STEP_SECONDS_PER_MEGAPIXEL)
     )
     pilot_gaussians = usual_budget(size.pixels, size.pixels, BUDGET_REFERENCE_STEPS)
-    step_seconds, pilot_step_seconds = (
+    step_seconds, pilot_step_seconds, teacher_step_seconds = (
         seconds_per_step + megapixels * seconds_per_megapixel * size.mean_step_cost(DensityConfig(), count, count)
-        for count in (gaussians, pilot_gaussians)
+        for count in (gaussians, pilot_gaussians, teacher_gaussians)
     )
+    set_up_seconds = 2 + estimate_depth_map_seconds(trained)
+    teachers = count_teachers(trained, size, plan.train_config(seed=0))
+    teacher_seconds = set_up_seconds + TEACHER_STEPS * teacher_step_seconds
     return {
         "pilots": pilot_steps * pilot_step_seconds,
-        "training": 2 + estimate_depth_map_seconds(trained) + plan.steps * step_seconds,
+        "teachers": teachers * (teacher_seconds + trained * megapixels * CPU_PASS_SECONDS_PER_MEGAPIXEL / 2),
+        "training": set_up_seconds + plan.steps * step_seconds,
         "results": 2 + (BACKGROUND_SEARCH_PASSES + scoring_passes) * megapixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
         "compression": 3
         + (count_packing_passes(gaussians) + 3 * plan.finetune_steps) * megapixels * CPU_PASS_SECONDS_PER_MEGAPIXEL,
@@ -206,7 +207,9 @@ def estimate_scene_seconds(scene: Scene, plan: Plan, device: torch.device) -> di
     gaussians, _ = budget_for(scene, config)
     size = PhotoSize.of_views(scene.train)
     pilot_steps = max_pilot_steps(scene, config)
-    return estimate_seconds(size, plan, gaussians, len(scene.train), len(scene.test), pilot_steps, device)
+    teacher_gaussians, _ = budget_for(scene, replace(config, steps=TEACHER_STEPS))
+    counts = len(scene.train), len(scene.test)
+    return estimate_seconds(size, plan, gaussians, *counts, pilot_steps, device, teacher_gaussians)
 
 
 def expected_photo_size(size: tuple[int, int] | None, max_size: int) -> PhotoSize:
@@ -222,7 +225,8 @@ def estimate_photos_seconds(count: int, size: PhotoSize, plan: Plan, device: tor
     pilot_steps = max_exposure_pilot_steps(trained, plan.steps) * (plan.steps >= MIN_EXPOSURE_STEPS)
     pilot_steps += MAX_BUDGET_PILOT_STEPS * (plan.steps >= MIN_BUDGET_STEPS)
     pilot_steps += max_length_pilot_steps(trained, plan.steps) * plan.early_stop
+    teacher_gaussians = usual_budget(size.pixels, trained * size.pixels, TEACHER_STEPS)
     return {
         "poses": POSE_SECONDS_PER_PHOTO * count,
-        **estimate_seconds(size, plan, gaussians, trained, count // 8, pilot_steps, device),
+        **estimate_seconds(size, plan, gaussians, trained, count // 8, pilot_steps, device, teacher_gaussians),
     }

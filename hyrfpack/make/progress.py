@@ -10,9 +10,9 @@ from hyrfpack.progress import Event, Progress, StageEvent, TaskEvent
 from hyrfpack.progress.pace import SharePace
 from hyrfpack.progress.status import OVERDUE_TIME_RATIO
 
-# Training consists of pilot runs that decide settings, the run itself, and its scores and pictures.
-STAGE_PARTS = {"training": ("pilots", "training", "results")}
-PACED_PARTS = ("pilots", "training")  # all steps are alike, so their pace shows how fast the machine is
+# Training consists of pilot runs that decide settings, teacher runs, the run itself, and its scores and pictures.
+STAGE_PARTS = {"training": ("pilots", "teachers", "training", "results")}
+PACED_PARTS = ("pilots", "teachers", "training")  # all steps are alike, so their pace shows how fast the machine is
 UNPACED_PARTS = ("poses", "measurement")  # their time does not depend on the pace of training
 FULL_TRUST_SECONDS = 20.0  # after this time only the measured pace counts, not the forecast
 # Limits of the slowdown, the ratio of measured to forecast seconds.

@@ -309,7 +309,7 @@ class _Pipeline:
 
     def _decide_plan(self, path: Path, load_settings: LoadSettings, scene: Scene) -> tuple[Plan, Scene]:
         """Return the plan, which fits into a time limit if there is one, and the scene at the plan's size of photos."""
-        request, requested = self.request, self._requested_plan(PhotoSize.of_views(scene.views))
+        request, requested = self.request, self._requested_plan(PhotoSize.of_views(scene.train))
         if request.config.minutes is None:
             return requested, scene
         end = self.start_seconds + 60 * request.config.minutes

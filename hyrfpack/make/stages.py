@@ -43,6 +43,7 @@ from hyrfpack.splats.files import list_source_files
 from hyrfpack.train import Trainer, train_model
 from hyrfpack.train.decisions import measures_length
 from hyrfpack.train.run import is_begun
+from hyrfpack.train.teachers import TEACHER_TASK_PREFIX
 
 _LOG = logging.getLogger(__name__)
 
@@ -167,7 +168,7 @@ def _train(
     def observe(trainer: Trainer) -> None:
         # A finished trainer is not kept, so that its memory is free while results are written.
         # No preview is written of a pilot run, which is short and lacks the validation photos.
-        is_main_run = trainer.kind != "pilot run"
+        is_main_run = trainer.kind not in ("pilot run", "teacher run")
         unfinished[:] = [trainer] if is_main_run and trainer.step < trainer.steps else []
         if observer is not None:
             observer(trainer)
@@ -217,7 +218,7 @@ def _split_inputs(scene: Scene) -> dict[str, Any]:
 
 
 class _TrainingProgress:
-    """Reports the parts of a training run: pilot runs, steps, then scores and pictures."""
+    """Reports the parts of a training run: pilot runs, teacher runs, steps, then scores and pictures."""
 
     def __init__(self, reporter: Reporter) -> None:
         self._reporter, self._part, self._means = reporter, "pilots", StepMeans()
@@ -237,6 +238,8 @@ class _TrainingProgress:
             if event.step == event.steps:
                 self._begin("results")
         elif isinstance(event, TaskEvent):
+            if event.task.startswith(TEACHER_TASK_PREFIX):
+                self._begin("teachers")
             if self._part == "results" and event.total:
                 event = replace(event, share=event.done / event.total)
             self._reporter.report_event(event)

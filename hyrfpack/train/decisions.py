@@ -79,9 +79,7 @@ def chosen_steps(scene: Scene, config: TrainConfig, steps: object, asked_steps: 
         `steps` if pilots may have chosen it for a run with these settings, else `config.steps`.
     """
     could_be_chosen = (
-        asked_steps in (None, config.steps)
-        and measures_length(scene, config)
-        and steps in pilot_lengths(config.steps, len(scene.train))
+        asked_steps in (None, config.steps) and measures_length(scene, config) and steps in pilot_lengths(config.steps)
     )
     return steps if could_be_chosen and isinstance(steps, int) else config.steps
 

@@ -12,34 +12,27 @@ import dataclasses
 from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, ScenePilots, quality_score
 from hyrfpack.train.setup import budget_for
 
-PILOT_LENGTHS_STEPS = (1_000, 3_000, 10_000)
+PILOT_LENGTHS_STEPS = (3_000, 10_000)
 MIN_LENGTH_RATIO = 2  # The run is at least this many times as long as any shorter pilot.
-# Pilots take as long as the run itself. They pay only where a longer run is likely to overfit.
-MAX_UNMEASURED_STEPS = 3_000
-# With more training photos than FEW_PHOTOS, only runs that are MIN_LENGTH_RATIO times as long as the longest pilot are
-# measured, and not against the shortest. With more than MAX_MEASURED_PHOTOS, none is.
+# Pilots take as long as the run itself, so they pay only where a longer run is likely to overfit. With more training
+# photos than FEW_PHOTOS, only runs that are MIN_LENGTH_RATIO times as long as the longest pilot are measured. With more
+# than MAX_MEASURED_PHOTOS, none is.
 FEW_PHOTOS = 30
 MAX_MEASURED_PHOTOS = 100
 LENGTH_VALIDATION_EVERY = 4  # One in this many training photos is a validation photo.
 
 
-def pilot_lengths(steps: int, photos: int) -> list[int]:
-    """Return the numbers of steps that are compared for a run of `steps` steps; the last one is `steps`.
-
-    Args:
-        steps: number of steps of the run.
-        photos: number of its training photos.
-    """
-    candidates = PILOT_LENGTHS_STEPS if photos <= FEW_PHOTOS else PILOT_LENGTHS_STEPS[1:]
-    return [*(length for length in candidates if MIN_LENGTH_RATIO * length <= steps), steps]
+def pilot_lengths(steps: int) -> list[int]:
+    """Return the numbers of steps that are compared for a run of `steps` steps; the last one is `steps`."""
+    return [*(length for length in PILOT_LENGTHS_STEPS if MIN_LENGTH_RATIO * length <= steps), steps]
 
 
 def max_length_pilot_steps(photos: int, steps: int) -> int:
     """Return the most steps that the pilots take before a run of `steps` steps on `photos` photos; 0 without pilots."""
     if not MIN_TRAINING_VIEWS <= photos <= MAX_MEASURED_PHOTOS:
         return 0
-    shortest = MAX_UNMEASURED_STEPS + 1 if photos <= FEW_PHOTOS else MIN_LENGTH_RATIO * PILOT_LENGTHS_STEPS[-1]
-    return sum(pilot_lengths(steps, photos)) * (steps >= shortest)
+    shortest = MIN_LENGTH_RATIO * PILOT_LENGTHS_STEPS[0 if photos <= FEW_PHOTOS else -1]
+    return sum(pilot_lengths(steps)) * (steps >= shortest)
 
 
 def measure_length(pilots: ScenePilots, exposure: bool, budget_factor: float | None) -> tuple[int, str]:
@@ -61,7 +54,7 @@ def measure_length(pilots: ScenePilots, exposure: bool, budget_factor: float | N
     Raises:
         TrainingStopped, HyrfError: as `ScenePilots.run`.
     """
-    lengths = pilot_lengths(pilots.config.steps, len(pilots.scene.train))
+    lengths = pilot_lengths(pilots.config.steps)
     fold = pilots.fold(LENGTH_VALIDATION_EVERY)
     if not fold.validation:
         return lengths[-1], "masks leave no pixel of the validation photos"

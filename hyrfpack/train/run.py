@@ -91,19 +91,19 @@ def train_model(
         scene: the scene, from `hyrfpack.load_scene`.
         out: the run's folder, created if missing.
         config: settings of the run; None for the defaults.
-        resume: resume from the folder's checkpoint or pilot runs, or complete the results of a finished model. The
-            result equals that of an uninterrupted run.
+        resume: resume from the folder's checkpoint, pilot or teacher runs, or complete the results of a finished
+            model. The result equals that of an uninterrupted run.
         overwrite: replace an earlier run in the folder. Without it, nothing is replaced. If a file appears at a
             result's name during training, the result gets a free name beside it; `TrainResult.model` has the model's.
         observer: called after each step with the trainer, whose model it may read and must not change; after steps of
-            pilot and teacher runs, too, whose trainer has the `kind` "pilot run". Of several processes only rank 0
-            calls it. Its time does not count as training time.
+            pilot and teacher runs, too, whose trainer has the `kind` "pilot run" or "teacher run". Of several processes
+            only rank 0 calls it. Its time does not count as training time.
         log: a file that gets a line of JSON every few steps, and TensorBoard files beside it if that is installed; see
             `hyrfpack.train.log.TrainingLog`. A resumed run appends to it.
         context: device, processes, progress and stop. A run may be resumed on another device; on a GPU sums of
             gradients vary in their last bits from run to run, which may change the measured budget. Only rank 0 returns
             metrics. If the launcher restarts the processes, as torchrun does after one has ended, they resume from any
-            checkpoint. Each step of the run is a `StepEvent`; all other work, pilot runs included, gives `TaskEvent`s.
+            checkpoint. Each step of the run is a `StepEvent`; all other work, such as pilot runs, gives `TaskEvent`s.
 
     Raises:
         HyrfError: before the first step, if another call is working in the folder, the folder holds another run, the
@@ -351,7 +351,7 @@ class _Run:
 
 
 def is_begun(out: Path) -> bool:
-    """Return whether a run in the folder can be resumed: pilot runs, a checkpoint, or a model with missing results."""
+    """Return whether a run in the folder can be resumed, or a model that lacks results can be completed."""
     return (out / CHECKPOINT_FILE).is_file() or is_prepared(out) or read_record(out) is not None
 
 

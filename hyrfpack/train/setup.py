@@ -36,6 +36,10 @@ GAUSSIANS_PER_PIXEL_OF_ALL_PHOTOS = 1 / 240
 # This bounds the time of short runs on large photos. Runs of 2,000 steps reach it on photos of 830 x 550 pixels.
 MAX_GAUSSIANS_PER_STEP = 50
 MIN_BUDGET = 5_000
+# A run on large photos has more Gaussians and takes fewer steps, because at equal time that scores higher on a CPU.
+SMALL_PHOTO_PIXELS = 190_000
+LARGE_PHOTO_PIXELS = 1_700_000
+LARGE_PHOTO_STEPS = 2_000
 # A packed file is assumed to take this many bytes for decoders and headers, and for each Gaussian with its table rows.
 # By default `compress` takes 4 to 8 bytes per Gaussian. Of two files of equal size, the one with more Gaussians and
 # coarser numbers scores higher, down to about 5 bytes.
@@ -149,6 +153,22 @@ def usual_budget(photo_pixels: float, all_pixels: float, steps: int, factor: flo
     length = math.sqrt(min(1.0, steps / FULL_STEPS))
     suggested, limit = (max(MIN_BUDGET, count) for count in (round(full * length), MAX_GAUSSIANS_PER_STEP * steps))
     return max(1, min(round(factor * suggested), round(max(1.0, factor) * limit)))
+
+
+def usual_steps(
+    photo_pixels: float, small_photo_steps: int = TrainConfig.steps, large_photo_steps: int = LARGE_PHOTO_STEPS
+) -> int:
+    """Return the usual number of steps for photos of this size: a power law between small and large photos.
+
+    It suits a CPU. On a GPU, longer runs are usual.
+
+    Args:
+        photo_pixels: mean number of pixels of a training photo.
+        small_photo_steps: steps on photos of at most `SMALL_PHOTO_PIXELS`.
+        large_photo_steps: steps on photos of `LARGE_PHOTO_PIXELS` or more.
+    """
+    exponent = math.log(photo_pixels / SMALL_PHOTO_PIXELS) / math.log(LARGE_PHOTO_PIXELS / SMALL_PHOTO_PIXELS)
+    return round(small_photo_steps * (large_photo_steps / small_photo_steps) ** min(max(exponent, 0.0), 1.0))
 
 
 def check_target(scene: Scene, config: TrainConfig) -> None:

@@ -22,6 +22,8 @@ from hyrfpack.parallel.ranks import Ranks
 from hyrfpack.progress import Progress, StepEvent, TaskEvent
 from hyrfpack.scene import Scene, View
 from hyrfpack.train.pilot_journal import pilot_key
+from hyrfpack.train.resolution import PhotoSize
+from hyrfpack.train.setup import check_has_photos, usual_steps
 from hyrfpack.train.stop import TrainingStopped
 from hyrfpack.train.trainer import Trainer
 from hyrfpack.train.virtual_views import render_virtual_views
@@ -31,12 +33,23 @@ _LOG = logging.getLogger(__name__)
 TEACHER_STEPS = 1_000
 MAX_TAUGHT_PHOTOS = 30
 MIN_TAUGHT_PHOTOS = 2  # Virtual views lie between two cameras.
-MIN_TAUGHT_STEPS = 2_000
+TEACHER_TASK_PREFIX = "teacher run"
 
 
-def can_have_teachers(photos: int, steps: int) -> bool:
-    """Return whether a run of so many steps on so many photos may have virtual views."""
-    return MIN_TAUGHT_PHOTOS <= photos <= MAX_TAUGHT_PHOTOS and steps >= MIN_TAUGHT_STEPS
+def count_teachers(photos: int, size: PhotoSize, config: TrainConfig) -> int:
+    """Return the number of teacher runs before a run; 0 if it has none.
+
+    A run has teachers if its settings ask for virtual views, its photos are few, and it takes at least `usual_steps`.
+    For a shorter one, they would take most of the time.
+
+    Args:
+        photos: number of training photos.
+        size: their size.
+        config: settings of the run.
+    """
+    are_few = MIN_TAUGHT_PHOTOS <= photos <= MAX_TAUGHT_PHOTOS
+    is_taught = config.virtual_views and are_few and config.steps >= usual_steps(size.pixels)
+    return len(TEACHER_FILES) * is_taught
 
 
 def describe_virtual_views(count: int) -> str:
@@ -70,21 +83,14 @@ class TeacherRuns:
     observer: Callable[[Trainer], None] | None
 
     def virtual_views(self) -> list[View]:
-        """Return the virtual views of the run, if its settings ask for them and `can_have_teachers` allows them.
+        """Return the virtual views of the run; none if it has no teachers (`count_teachers`).
 
         Raises:
             TrainingStopped: `stop` returned True.
             HyrfError: as `Trainer.run`.
         """
-        if not self.config.virtual_views:
-            return []
-        if not can_have_teachers(photos := len(self.scene.train), self.config.steps):
-            if self.ranks.is_main:
-                _LOG.warning(
-                    f"no virtual views: a run has them if it takes {MIN_TAUGHT_STEPS:,} steps or more on "
-                    f"{MIN_TAUGHT_PHOTOS} to {MAX_TAUGHT_PHOTOS} photos, and this one takes {self.config.steps:,} on "
-                    f"{photos:,}"
-                )
+        check_has_photos(self.scene)
+        if not count_teachers(len(self.scene.train), PhotoSize.of_views(self.scene.train), self.config):
             return []
         teachers = [self._teacher(number).to(self.device) for number in range(len(TEACHER_FILES))]
         self.progress(TaskEvent("rendering virtual views"))
@@ -107,12 +113,12 @@ class TeacherRuns:
     def _train(self, number: int, settings: TrainConfig) -> HybridModel:
         """Train a teacher."""
         count = len(TEACHER_FILES)
-        name = f"teacher run {number + 1}/{count}"
+        name = f"{TEACHER_TASK_PREFIX} {number + 1}/{count}"
         self.progress(TaskEvent(f"{name}: reading photos"))
         trainer = self.ranks.run_on_all(
             lambda: Trainer(self.scene, settings, self.cache, self.device, ranks=self.ranks)
         )
-        trainer.kind = "pilot run"
+        trainer.kind = "teacher run"
 
         def report_step(event: StepEvent) -> None:
             share = (number + event.step / event.steps) / count

@@ -78,8 +78,8 @@ class Trainer:
         steps: number of optimiser steps of the whole run.
         spacing: distance between the initial Gaussians in local units, see `gaussian_spacing`.
         learning_rates: those of `config`, adapted to this spacing (`LearningRates.at_spacing`).
-        kind: "pilot run" (`hyrfpack.train.pilots`, `hyrfpack.train.teachers`), "first look" (`hyrfpack.make`), or empty
-            for the run itself.
+        kind: "pilot run" (`hyrfpack.train.pilots`), "teacher run" (`hyrfpack.train.teachers`), "first look"
+            (`hyrfpack.make`), or empty for the run itself.
         renderer: renders the training views and computes their gradients.
 
     Example:
@@ -155,7 +155,7 @@ class Trainer:
         self.resolution = ResolutionSchedule(scene.train, self.steps, len(self.model), is_on=config.resolution_schedule)
         self.step = 0
         self._launched: LaunchedStep | None = None  # The step whose numbers were not read yet.
-        self.kind: Literal["", "pilot run", "first look"] = ""
+        self.kind: Literal["", "pilot run", "teacher run", "first look"] = ""
         self.saved: int | None = None  # The step of the checkpoint on disk.
         self.records: list[dict] = []
         self.seconds: dict[str, float] = defaultdict(float)  # By stage, summed over all parts of a resumed run.

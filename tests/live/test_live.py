@@ -141,9 +141,16 @@ def test_snapshots_take_less_than_3_percent_of_the_time_however_large_the_model_
 
 @pytest.mark.parametrize(
     ("kind", "expected"),
-    [("", [1, 1, 1, 1, 5]), ("first look", [1, 1, 1, 1, 5]), ("pilot run", [1, 1, 1, 1, 1])],
+    [
+        ("", [1, 1, 1, 1, 5]),
+        ("first look", [1, 1, 1, 1, 5]),
+        ("pilot run", [1, 1, 1, 1, 1]),
+        ("teacher run", [1, 1, 1, 1, 1]),
+    ],
 )
-def test_the_first_step_and_the_last_one_of_all_but_pilot_runs_are_always_shown(kind, expected, monkeypatch):
+def test_the_first_step_and_the_last_one_of_all_but_pilot_and_teacher_runs_are_always_shown(
+    kind, expected, monkeypatch
+):
     monkeypatch.setattr("hyrfpack.live.view.encode_model", lambda *_: b"snapshot")
     monkeypatch.setattr("hyrfpack.live.view.training_provenance", lambda *_, **__: {})
     view, shown = LiveView(Clock()), []

@@ -53,7 +53,9 @@ def fake_stages(monkeypatch) -> None:
     monkeypatch.setattr(stages, "train_model", fake_train_model)
     monkeypatch.setattr(stages, "compress_model", fake_compress_model)
     monkeypatch.setattr(stages, "evaluate_model", fake_evaluate_model)
-    monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(1e-3, 0.0, 0.0, 0.0, 100))
+    monkeypatch.setattr(
+        minutes, "measure_scene_cost", lambda _, requested, *__: SceneCost(1e-3, 0.0, 0.0, 0.0, 100, requested)
+    )
 
 
 @pytest.fixture

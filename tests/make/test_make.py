@@ -52,6 +52,23 @@ def test_pilot_runs_do_not_count_in_the_forecast_of_training(monkeypatch):
     )
 
 
+def test_teacher_runs_are_a_part_of_the_training_between_pilot_runs_and_steps():
+    messages: list[StageEvent] = []
+    reporter = Reporter(["training"], messages.append)
+    reporter.estimates |= {"pilots": 10.0, "teachers": 20.0, "training": 30.0, "results": 0.0}
+    reporter.begin("training")
+    shown = stages._TrainingProgress(reporter)
+    events = [
+        TaskEvent("pilot run", share=0.5),
+        TaskEvent("teacher run 1/3: training", 0.25, 750, 1_000),
+        TaskEvent("rendering virtual views"),
+        StepEvent(1, 2, 0.1, 0.01, 500),
+    ]
+    for event, share in zip(events, (5, 15, 15, 45), strict=True):
+        shown.report_event(event)
+        assert messages[-1].share == pytest.approx(share / 60)
+
+
 def test_scoring_after_the_last_step_is_part_of_the_training_progress():
     messages: list[StageEvent] = []
     reporter = Reporter(["training"], messages.append)

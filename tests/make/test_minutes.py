@@ -22,6 +22,8 @@ from hyrfpack.make.source import LoadSettings
 from hyrfpack.progress import StageEvent, ignore_progress
 from hyrfpack.scene import Scene
 from hyrfpack.train import decisions
+from hyrfpack.train.resolution import PhotoSize
+from hyrfpack.train.setup import usual_steps
 
 
 def make_plan(target_bytes: int | None = None, max_gaussians: int | None = None) -> Plan:
@@ -68,6 +70,30 @@ def test_a_smaller_model_takes_less_time(scene):
     )
 
 
+def test_teacher_runs_on_few_photos_are_part_of_the_time(scene):
+    steps = usual_steps(PhotoSize.of_views(scene.train).pixels)
+    longer = MEASURED_COST.total_seconds(scene, steps) - MEASURED_COST.total_seconds(scene, steps - 1)
+    assert longer > MEASURED_COST.teacher_seconds(scene, steps) > 2 * MEASURED_COST.training_seconds(scene, 1_000)
+    assert MEASURED_COST.teacher_seconds(scene, steps - 1) == 0
+
+
+def test_time_that_is_too_short_for_teacher_runs_is_used_for_more_steps(scene):
+    usual = usual_steps(PhotoSize.of_views(scene.train).pixels)
+    alone, taught = (MEASURED_COST.total_seconds(scene, steps) for steps in (usual - 1, usual))
+    short, between, long = (
+        MEASURED_COST.plan_within(scene, seconds) for seconds in (alone - 1, (alone + taught) / 2, taught + 1)
+    )
+    assert short.steps < usual and (short.virtual_views, between.virtual_views, long.virtual_views) == (
+        True,
+        False,
+        True,
+    )
+    assert long.steps >= usual
+    without = replace(MEASURED_COST, requested=between)
+    assert without.total_seconds(scene, between.steps) <= (alone + taught) / 2
+    assert (alone + taught) / 2 < without.total_seconds(scene, between.steps + 1)
+
+
 def test_a_linear_fit_is_exact_on_a_line_and_never_decreases():
     counts = list(range(100, 1000, 20))
     assert minutes._fit_line(counts, [0.5 + 1e-3 * n for n in counts]) == pytest.approx((0.5, 1e-3))
@@ -103,8 +129,8 @@ def fitted_plan(
 
 
 def test_large_photos_are_reduced_when_time_is_short(posed, scene, monkeypatch, caplog):
-    def cost(scene, *_):
-        return SceneCost(5e-4 * scene.train[0].camera.width ** 2, 0.0, 0.0, 0.0, 100)
+    def cost(scene, requested, *_):
+        return SceneCost(5e-4 * scene.train[0].camera.width ** 2, 0.0, 0.0, 0.0, 100, requested)
 
     monkeypatch.setattr(minutes, "measure_scene_cost", cost)
     monkeypatch.setattr(minutes, "CANDIDATE_PHOTO_SIZES", (28, 24, 16))
@@ -120,9 +146,9 @@ def test_large_photos_are_reduced_when_time_is_short(posed, scene, monkeypatch, 
 def test_photos_that_are_small_already_are_timed_at_the_size_asked_for(posed, scene, monkeypatch):
     timed: list[int] = []
 
-    def cost(scene, *_):
+    def cost(scene, requested, *_):
         timed.append(max(scene.train[0].camera.width, scene.train[0].camera.height))
-        return SceneCost(1e-3, 0.0, 0.0, 0.0, 100)
+        return SceneCost(1e-3, 0.0, 0.0, 0.0, 100, requested)
 
     monkeypatch.setattr(minutes, "measure_scene_cost", cost)
     monkeypatch.setattr(minutes, "CANDIDATE_PHOTO_SIZES", (24, 16, 8))
@@ -132,7 +158,9 @@ def test_photos_that_are_small_already_are_timed_at_the_size_asked_for(posed, sc
 
 
 def test_a_long_run_has_the_measured_budget_and_a_short_one_the_default(posed, scene, monkeypatch):
-    monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(0.0, 1e-5, 0.0, 0.0, 100))
+    monkeypatch.setattr(
+        minutes, "measure_scene_cost", lambda _, requested, *__: SceneCost(0.0, 1e-5, 0.0, 0.0, 100, requested)
+    )
     monkeypatch.setattr(decisions, "measure_budget", lambda *_: (0.5, "by a coin"))
 
     def planned(seconds: float, target_bytes: int | None = None) -> Plan:
@@ -154,14 +182,18 @@ def test_too_little_time_gives_a_draft_with_a_note(posed, scene, caplog):
 
 
 def test_an_explicit_number_of_gaussians_replaces_the_measured_budget(posed, scene, monkeypatch):
-    monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(0.0, 1e-5, 0.0, 0.0, 100))
+    monkeypatch.setattr(
+        minutes, "measure_scene_cost", lambda _, requested, *__: SceneCost(0.0, 1e-5, 0.0, 0.0, 100, requested)
+    )
     monkeypatch.setattr(decisions, "measure_budget", None)
     plan = fitted_plan(posed, scene, make_plan(max_gaussians=700), 600)
     assert (plan.train_config(0).max_gaussians, plan.budget_factor) == (700, None)
 
 
 def test_photos_are_never_larger_than_asked_for(posed, scene, monkeypatch):
-    monkeypatch.setattr(minutes, "measure_scene_cost", lambda *_: SceneCost(1e-3, 0.0, 0.0, 0.0, 100))
+    monkeypatch.setattr(
+        minutes, "measure_scene_cost", lambda _, requested, *__: SceneCost(1e-3, 0.0, 0.0, 0.0, 100, requested)
+    )
     load_settings = LoadSettings(max_size=24)
     for seconds in (600.0, -1.0):
         assert fitted_plan(posed, load_settings.load(posed), make_plan(90_000), seconds, load_settings).max_size == 24
@@ -179,7 +211,7 @@ def test_the_measured_cost_is_kept_by_the_next_call(posed, tmp_path, monkeypatch
 def test_with_a_kept_measurement_the_remaining_time_is_estimated_again(posed, tmp_path, monkeypatch):
     make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(minutes=0.01))
     (tmp_path / "scene.work" / "run" / "model.hyrf").unlink()
-    parts = ("pilots", "training", "results", "compression", "scoring", "export")
+    parts = ("pilots", "teachers", "training", "results", "compression", "scoring", "export")
     monkeypatch.setattr("hyrfpack.make.run.estimate_scene_seconds", lambda *_: dict.fromkeys(parts, 1234.0))
     events: list[StageEvent] = []
     context = RunContext(progress=events.append)

@@ -7,15 +7,15 @@ import torch
 
 from hyrfpack.make.plan import (
     DEPTH_MAP_SECONDS_PER_PHOTO,
-    LARGE_PHOTO_PIXELS,
     QUALITIES,
-    SMALL_PHOTO_PIXELS,
     Plan,
     estimate_photos_seconds,
     estimate_seconds,
     expected_photo_size,
 )
 from hyrfpack.train.resolution import PhotoSize
+from hyrfpack.train.setup import LARGE_PHOTO_PIXELS, SMALL_PHOTO_PIXELS
+from hyrfpack.train.teachers import count_teachers
 
 CPU_DEVICE, GPU_DEVICE = torch.device("cpu"), torch.device("cuda")
 REAL_QUALITIES = dict(QUALITIES)  # while tests run, quick ones replace them (conftest.py)
@@ -70,15 +70,33 @@ def test_the_estimate_grows_with_photos_pixels_and_steps():
         return estimate_photos_seconds(count, expected_photo_size((side, side), 1600), plan, CPU_DEVICE)
 
     usual = seconds(60, 800, 1_000)
-    assert all(value > 0 for value in usual.values())
+    assert all((value > 0) == (part != "teachers") for part, value in usual.items())
     assert seconds(120, 800, 1_000)["poses"] > usual["poses"]
     assert seconds(60, 1600, 1_000)["training"] > usual["training"]
     assert seconds(60, 800, 3_000)["training"] > usual["training"]
 
 
+def test_few_photos_take_time_for_teacher_runs():
+    def seconds(count, side=800, steps=3_000):
+        plan = Plan(steps, max_size=1600)
+        return estimate_photos_seconds(count, expected_photo_size((side, side), 1600), plan, CPU_DEVICE)["teachers"]
+
+    assert 0 < seconds(34) < seconds(34, 1600)
+    assert seconds(34, steps=1_999) == seconds(36) == 0
+
+
+@pytest.mark.parametrize("sizes", [[(480, 320)], [(900, 600), (640, 480), (1201, 799)], [(1600, 1066), (1600, 1200)]])
+def test_a_plan_for_few_photos_has_teacher_runs_whatever_their_size(sizes):
+    size = PhotoSize.of(sizes)
+    steps = REAL_QUALITIES["normal"].training_steps(size.pixels, CPU_DEVICE)
+    assert count_teachers(12, size, Plan(steps, max_size=1600).train_config(seed=0)) == 3
+
+
 def test_the_estimate_of_the_training_includes_depth_maps_of_at_most_100_photos():
     def training_seconds(trained):
-        return estimate_seconds(PhotoSize(250_000, 500), Plan(1_000, 800), 5_000, trained, 0, 0, CPU_DEVICE)["training"]
+        return estimate_seconds(PhotoSize(250_000, 500), Plan(1_000, 800), 5_000, trained, 0, 0, CPU_DEVICE, 1)[
+            "training"
+        ]
 
     assert training_seconds(50) - training_seconds(0) == pytest.approx(50 * DEPTH_MAP_SECONDS_PER_PHOTO)
     assert training_seconds(1_000) == training_seconds(100) > training_seconds(99)

@@ -213,7 +213,6 @@ def test_results_of_a_run_without_length_pilots_are_not_completed_with_more_step
     scene = ball_scene(views=10, points=60, side=24)
     full_disk_suffixes.add("curve.png")
     train_model(scene, tmp_path, TrainConfig(steps=8), context=QUIET_CONTEXT)
-    monkeypatch.setattr(length_pilots, "MAX_UNMEASURED_STEPS", 10)
     monkeypatch.setattr(length_pilots, "PILOT_LENGTHS_STEPS", (8,))
     for resume in (False, True):
         with pytest.raises(HyrfTrainingError, match=r"other settings \(steps\)"):

@@ -12,7 +12,7 @@ from hyrfpack.data.preset import detect_preset
 from hyrfpack.errors import HyrfDataError, HyrfTrainingError
 from hyrfpack.model import Frame
 from hyrfpack.scene import Picture, Scene, evenly_spaced
-from hyrfpack.train import TrainConfig, Trainer
+from hyrfpack.train import TrainConfig, Trainer, train_model
 from hyrfpack.train.setup import (
     MAX_TARGETED_BUDGET_RATIO,
     MIN_TARGETED_BUDGET,
@@ -445,11 +445,12 @@ def test_building_does_not_use_the_global_random_generators():
     assert torch.equal(torch.rand(3), expected[0]) and np.array_equal(np.random.rand(3), expected[1])
 
 
-@pytest.mark.parametrize("build", [build_model, Trainer])
-def test_a_scene_without_training_views_is_rejected(build):
+@pytest.mark.parametrize("build", [build_model, Trainer, train_model])
+def test_a_scene_without_training_views_is_rejected(build, tmp_path):
     scene = dataclasses.replace(ball_scene(), train=[], test=ball_scene().train)
+    folder = [tmp_path] if build is train_model else []
     with pytest.raises(HyrfTrainingError, match="no views are left for training"):
-        build(scene, TrainConfig())
+        build(scene, *folder, TrainConfig())
 
 
 def test_the_tests_photos_show_the_balls():

@@ -21,17 +21,19 @@ from hyrfpack.progress import Event, TaskEvent
 from hyrfpack.render import RenderSettings, render_view
 from hyrfpack.train import TrainConfig, Trainer, teachers, train_model
 from hyrfpack.train.exposure_map import fit_exposure_map
+from hyrfpack.train.resolution import PhotoSize
 from hyrfpack.train.run import is_begun
-from hyrfpack.train.teachers import MAX_TAUGHT_PHOTOS, MIN_TAUGHT_STEPS, can_have_teachers
+from hyrfpack.train.teachers import MAX_TAUGHT_PHOTOS, count_teachers
 from hyrfpack.train.virtual_views import render_virtual_views
 
-TAUGHT_CONFIG = TrainConfig(steps=10, max_gaussians=60, exposure=False, virtual_views=True)
+TAUGHT_CONFIG = TrainConfig(steps=10, max_gaussians=60, exposure=False)
+SMALL_PHOTOS, LARGE_PHOTOS = (PhotoSize(width * height, height) for width, height in ((480, 320), (1600, 1200)))
 
 
 @pytest.fixture
 def short_teachers(monkeypatch) -> None:
     """Runs of ten steps have teachers, too, of four steps."""
-    monkeypatch.setattr(teachers, "MIN_TAUGHT_STEPS", 10)
+    monkeypatch.setattr(teachers, "usual_steps", lambda _: 10)
     monkeypatch.setattr(teachers, "TEACHER_STEPS", 4)
 
 
@@ -108,25 +110,21 @@ def test_virtual_views_of_large_photos_are_smaller():
 
 
 @pytest.mark.parametrize(
-    ("photos", "steps", "expected"),
+    ("photos", "size", "steps", "expected"),
     [
-        (MAX_TAUGHT_PHOTOS, MIN_TAUGHT_STEPS, True),
-        (2, MIN_TAUGHT_STEPS, True),
-        (1, MIN_TAUGHT_STEPS, False),
-        (MAX_TAUGHT_PHOTOS + 1, MIN_TAUGHT_STEPS, False),
-        (8, MIN_TAUGHT_STEPS - 1, False),
+        (MAX_TAUGHT_PHOTOS, SMALL_PHOTOS, 3_000, 3),
+        (2, SMALL_PHOTOS, 3_000, 3),
+        (1, SMALL_PHOTOS, 3_000, 0),
+        (MAX_TAUGHT_PHOTOS + 1, SMALL_PHOTOS, 3_000, 0),
+        (8, SMALL_PHOTOS, 2_999, 0),
+        (8, LARGE_PHOTOS, 2_000, 3),
+        (8, LARGE_PHOTOS, 1_999, 0),
     ],
 )
-def test_only_long_runs_on_few_photos_have_teachers(photos, steps, expected):
-    assert can_have_teachers(photos, steps) is expected
-
-
-def test_a_run_that_cannot_have_virtual_views_says_so(tmp_path, caplog):
-    train_model(make_scene(6), tmp_path, TAUGHT_CONFIG, context=QUIET_CONTEXT)
-    assert (
-        "no virtual views: a run has them if it takes 2,000 steps or more on 2 to 30 photos, and this one takes 10 on 6"
-        in caplog.messages
-    )
+def test_only_runs_of_usual_length_on_few_photos_have_teachers(photos, size, steps, expected):
+    config = TrainConfig(steps=steps)
+    assert count_teachers(photos, size, config) == expected
+    assert count_teachers(photos, size, dataclasses.replace(config, virtual_views=False)) == 0
 
 
 def test_steps_take_photos_and_virtual_views_in_turn_and_the_last_ones_photos():

@@ -24,6 +24,8 @@ from hyrfpack.context import RunContext
 from hyrfpack.scene import Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig, train_model
 from hyrfpack.train.pilots import split
+from hyrfpack.train.resolution import PhotoSize
+from hyrfpack.train.teachers import count_teachers
 from tools.command import positive_integer, run_command
 from tools.json_files import merge_rows
 from tools.studies.set_variants import load_variant
@@ -82,7 +84,7 @@ def train_and_score(scene: Scene, validation: list[View], config: TrainConfig) -
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sets", nargs="+", default=list(DEFAULT_SETS), help="folders below --data, or variants")
-    parser.add_argument("--steps", type=positive_integer, default=2000, help="steps of each run (2,000)")
+    parser.add_argument("--steps", type=positive_integer, default=3000, help="steps of each run (3,000)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="random seeds, also folds of full sets (0)")
     parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the data sets")
     parser.add_argument(
@@ -96,6 +98,8 @@ def main() -> None:
             config = TrainConfig(
                 steps=args.steps, seed=seed, exposure=not scene.has_alpha, budget_factor=1.0, early_stop=False
             )
+            if not count_teachers(len(scene.train), PhotoSize.of_views(scene.train), config):
+                parser.error(f"{name} has too many photos for virtual views, or a run on them takes more steps")
             scores = []
             for virtual_views in (False, True):
                 score = train_and_score(scene, validation, dataclasses.replace(config, virtual_views=virtual_views))
