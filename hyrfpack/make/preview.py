@@ -10,7 +10,7 @@ from pathlib import Path
 from hyrfpack.compress import compress_model
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
-from hyrfpack.format import save_model
+from hyrfpack.format import describe_file, save_model
 from hyrfpack.make.stage_cache import StageCache
 from hyrfpack.train import Trainer
 from hyrfpack.train.provenance import training_provenance
@@ -30,18 +30,21 @@ def remove_preview(stage_cache: StageCache) -> None:
 def write_preview(stage_cache: StageCache, trainer: Trainer, context: RunContext) -> Path | None:
     """Compress the model of an interrupted run into `preview.hyrf` in the work folder.
 
-    The model has the quality of its last step: it was trained at a lower resolution and has more Gaussians than at the
-    end. The checkpoint stays, so the run can be resumed.
+    An interrupted run has trained at a lower resolution and has more Gaussians than at its end; a finished teacher run
+    has not. A preview of more steps, which an earlier call has left, is kept. The checkpoint stays, so the run can be
+    resumed.
 
     Args:
         stage_cache: the stages of the pipeline.
-        trainer: the trainer of the interrupted run.
+        trainer: the trainer of the interrupted run, or of a teacher run before it.
         context: context of the call.
 
     Returns:
         The path of the file; None if it cannot be written, which is logged, or if a second interruption skips it.
     """
     target, uncompressed = stage_cache.folder / PREVIEW_FILE, stage_cache.folder / _UNCOMPRESSED_FILE
+    if _read_steps(target) > trainer.step:
+        return target
     _LOG.info("stopping: compressing a preview of the scene; a second interruption skips it")
     provenance = {"steps": trainer.step, "choices": trainer.choices, **training_provenance(trainer.scene)}
     # The stop that ended the training must not end the compression, too.
@@ -59,3 +62,12 @@ def write_preview(stage_cache: StageCache, trainer: Trainer, context: RunContext
         with suppress(OSError):
             uncompressed.unlink(missing_ok=True)
     return target
+
+
+def _read_steps(preview: Path) -> int:
+    """Return the number of steps of the run that a preview shows; 0 if there is none, or it is damaged."""
+    try:
+        steps = describe_file(preview)["provenance"].get("steps")
+    except (HyrfError, OSError):
+        return 0
+    return steps if isinstance(steps, int) else 0

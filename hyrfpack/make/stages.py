@@ -148,7 +148,7 @@ def _train(
     observer: Callable[[Trainer], None] | None,
     context: RunContext,
 ) -> None:
-    """Train a model into `run/`. An interrupted main run leaves a preview of the scene beside its checkpoint.
+    """Train a model into `run/`. An interrupted training leaves a preview of the scene beside its checkpoint.
 
     Args:
         stage_cache: the stages of the pipeline.
@@ -163,13 +163,17 @@ def _train(
         HyrfError: it failed, or some of its results could not be written.
     """
     run = stage_cache.folder / RUN_FOLDER
-    unfinished: list[Trainer] = []  # the trainer of the main run until its last step
+    shown: list[Trainer] = []  # the trainer of which a preview would be written
+    begun: set[str] = set()  # the kinds of runs that have taken a step
 
     def observe(trainer: Trainer) -> None:
-        # A finished trainer is not kept, so that its memory is free while results are written.
-        # No preview is written of a pilot run, which is short and lacks the validation photos.
-        is_main_run = trainer.kind not in ("pilot run", "teacher run")
-        unfinished[:] = [trainer] if is_main_run and trainer.step < trainer.steps else []
+        # A pilot run is short and lacks the validation photos. A teacher is shown until the next run has as many steps.
+        # A finished main run is not kept, so that its memory is free while results are written.
+        begun.add(trainer.kind)
+        if trainer.kind == "" and trainer.step == trainer.steps:
+            shown.clear()
+        elif trainer.kind != "pilot run" and (not shown or trainer.step >= shown[0].step):
+            shown[:] = [trainer]
         if observer is not None:
             observer(trainer)
 
@@ -181,11 +185,11 @@ def _train(
         )  # fmt: skip
     except HyrfError as error:  # the fix of this error refers to the command `train`
         plain = error.__cause__ if isinstance(error.__cause__, HyrfError) else error
-        if resume and not unfinished and isinstance(plain, HyrfTrainingError):  # the checkpoint cannot be used
+        if resume and "" not in begun and isinstance(plain, HyrfTrainingError):  # the checkpoint cannot be used
             plain = plain.with_text(fix=f"delete {run} and run the same command again")
         raise plain from None
     if not trained.complete:
-        raise Stopped("training", write_preview(stage_cache, unfinished[-1], context) if unfinished else None)
+        raise Stopped("training", write_preview(stage_cache, shown[0], context) if shown else None)
     if not (run / METRICS_FILE).is_file():  # the disk was full; the next call writes them
         raise HyrfError(trained.missing, fix="run the same command again, which writes what is missing")
 

@@ -307,6 +307,46 @@ def test_interrupted_pilot_runs_leave_no_preview(posed, tmp_path, monkeypatch):
     assert stopped.value.scene is None
 
 
+@pytest.mark.parametrize(
+    ("runs", "shown"),
+    [
+        ([("teacher run", 3)], ("teacher run", 3)),
+        ([("teacher run", 1_000), ("teacher run", 3)], ("teacher run", 1_000)),
+        ([("teacher run", 1_000), ("", 3)], ("teacher run", 1_000)),
+        ([("teacher run", 1_000), ("", 1_000)], ("", 1_000)),
+        ([("", 3)], ("", 3)),
+        ([("teacher run", 1_000), ("", 3_000)], None),
+    ],
+)
+def test_a_preview_shows_a_teacher_run_until_the_next_run_has_as_many_steps(runs, shown, posed, tmp_path, monkeypatch):
+    previews: list[tuple[str, int]] = []
+
+    def stop(scene, run, config, *, observer, **options) -> TrainResult:
+        for kind, step in runs:
+            observer(SimpleNamespace(kind=kind, step=step, steps=3_000))
+        return TrainResult(False, 0, None, {})
+
+    monkeypatch.setattr(stages, "train_model", stop)
+    monkeypatch.setattr(stages, "write_preview", lambda _, trainer, __: previews.append((trainer.kind, trainer.step)))
+    with pytest.raises(Stopped, match="training"):
+        make_scene(posed, tmp_path / "scene.html")
+    assert previews == ([] if shown is None else [shown])
+
+
+def test_an_error_of_a_resumed_training_keeps_its_advice_once_the_run_has_begun(posed, tmp_path, monkeypatch):
+    with pytest.raises(Stopped):
+        make_scene(posed, tmp_path / "scene.html", context=RunContext(progress=stop_at_step_5))
+
+    def fail(scene, run, config, *, observer, **options) -> TrainResult:
+        for kind, step in (("teacher run", 1_000), ("", 3)):
+            observer(SimpleNamespace(kind=kind, step=step, steps=3_000))
+        raise HyrfTrainingError("the loss is not finite", fix="look at the photo")
+
+    monkeypatch.setattr(stages, "train_model", fail)
+    with pytest.raises(HyrfError, match="the loss is not finite; look at the photo"):
+        make_scene(posed, tmp_path / "scene.html")
+
+
 def test_a_checkpoint_that_cannot_be_used_comes_with_advice_that_works(posed, tmp_path, monkeypatch):
     with pytest.raises(Stopped):
         make_scene(posed, tmp_path / "scene.html", context=RunContext(progress=stop_at_step_5))

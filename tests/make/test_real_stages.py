@@ -27,6 +27,7 @@ from hyrfpack.make.progress import Reporter
 from hyrfpack.progress import StageEvent, ignore_progress
 from hyrfpack.progress.lines import LineDisplay
 from hyrfpack.splats.formats import ply
+from hyrfpack.train import teachers
 
 pytestmark = pytest.mark.usefixtures("quick_calibration")
 PRODUCT_PATHS = ("model.hyrf", "run/model.hyrf", "export/scene.html")
@@ -64,6 +65,28 @@ def test_a_stop_asked_by_the_context_leaves_a_preview(posed, tmp_path):
     with pytest.raises(Stopped, match="stopped in training") as stopped:
         make_scene(posed, tmp_path / "scene.html", context=context)
     assert stopped.value.scene == tmp_path / "scene.work" / "preview.hyrf" and stopped.value.scene.is_file()
+
+
+@pytest.mark.acceptance
+def test_a_call_that_is_stopped_before_the_steps_of_its_teachers_leaves_or_keeps_their_preview(
+    posed, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(teachers, "usual_steps", lambda _: 9)
+    monkeypatch.setattr(teachers, "TEACHER_STEPS", 4)
+    preview = tmp_path / "scene.work" / "preview.hyrf"
+
+    def stop_after(detail: str) -> int:
+        details: list[str] = []
+        context = RunContext(progress=lambda event: details.extend(event.details[:1]), stop=lambda: detail in details)
+        with pytest.raises(Stopped, match="stopped in training") as stopped:
+            make_scene(posed, tmp_path / "scene.html", context=context)
+        assert stopped.value.scene == preview
+        return describe_file(preview)["provenance"]["steps"]
+
+    assert stop_after("teacher run 2/3: training 1/4") == 4
+    assert stop_after("step 2/9") == 4
+    assert stop_after("step 6/9") == 6
+    assert make_scene(posed, tmp_path / "scene.html").output.exists() and not preview.exists()
 
 
 @pytest.mark.acceptance
