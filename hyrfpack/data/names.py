@@ -100,15 +100,18 @@ class PictureIndex:
     def match(self, names: Iterable[str]) -> NameMatches:
         """Find the files of all names together, so that no file is matched twice.
 
-        These rules apply in order: the exact path, to which a name without extension may lack one; the same path in
-        other letter cases or another Unicode form; the path without its extension; a name that ends with the file's
-        path or vice versa, the longest match first.
+        These rules apply in order: the exact path; a path that lacks only the extension; the same path in other letter
+        cases or another Unicode form; the path without its extension; a name that ends with the file's path or vice
+        versa, the longest match first.
         """
         wanted_names = list(dict.fromkeys(names))
-        exact_files = {name: self._find_exact(name) for name in wanted_names}
-        found = {name: files[0] for name, files in exact_files.items() if len(files) == 1}
+        found = {name: path for name in wanted_names if (path := self._find_exact(name)) is not None}
+        taken = set(found.values())
+        completed = {name: self._find_with_extension(name) for name in wanted_names if name not in found}
+        completed = {name: [file for file in files if file not in taken] for name, files in completed.items()}
+        found |= {name: files[0] for name, files in completed.items() if len(files) == 1}
         exact = set(found)
-        ambiguous = {name for name, files in exact_files.items() if len(files) > 1}
+        ambiguous = {name for name, files in completed.items() if len(files) > 1}
         for rule in () if len(found) + len(ambiguous) == len(wanted_names) else self._rules:
             fits = {name: rule(name) for name in wanted_names if name not in found and name not in ambiguous}
             taken = set(found.values())
@@ -128,15 +131,20 @@ class PictureIndex:
             return file.relative_to(self.folder).as_posix()
         return safe_name(listed)
 
-    def _find_exact(self, name: str) -> list[Path]:
-        """Find the file at exactly this path, or else the files whose paths have a picture's extension added to it."""
-        path = self.folder / name.replace("\\", "/")
+    def _path_of(self, name: str) -> Path:
+        """Return the path of a name in the folder."""
+        return self.folder / name.replace("\\", "/")
+
+    def _find_exact(self, name: str) -> Path | None:
+        """Find the file at exactly this path."""
+        path = self._path_of(name)
         # Raw files are not read; the rules may find a picture that was exported from this one.
-        if is_raw_name(path.name):
-            return []
-        if os.path.isfile(path):
-            return [path]
-        if path.name.lower().endswith(PICTURE_SUFFIXES):
+        return path if os.path.isfile(path) and not is_raw_name(path.name) else None
+
+    def _find_with_extension(self, name: str) -> list[Path]:
+        """Find the files whose paths have a picture's extension added to this one, which has none."""
+        path = self._path_of(name)
+        if is_raw_name(path.name) or path.name.lower().endswith(PICTURE_SUFFIXES):
             return []
         files = [candidate for candidate in _with_extensions(path) if os.path.isfile(candidate)]
         # A disk that ignores letter case has the same file under both spellings of an extension.

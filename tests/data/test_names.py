@@ -115,6 +115,15 @@ def test_a_file_is_matched_to_one_name_only(tmp_path):
     assert "2 photos were not matched (such as left/b.jpg)" in matches.notes[0]
 
 
+def test_a_name_without_extension_does_not_share_the_file_of_its_whole_name(tmp_path):
+    make_folder(tmp_path, "1.jpg", "2.jpg")
+
+    matches = PictureIndex(tmp_path).match(["1", "1.jpg", "2"])
+
+    assert matches.found == {"1.jpg": tmp_path / "1.jpg", "2": tmp_path / "2.jpg"}
+    assert not matches.ambiguous and not matches.inexact
+
+
 def test_notes_count_inexact_matches_and_give_an_example(tmp_path):
     make_folder(tmp_path, "a.jpg", "b.jpg", "c.png")
 
