@@ -143,7 +143,7 @@ class TrainConfig:
             runs. Default: measured by pilot runs.
         target_bytes: choose the budget so that 'hyrfpack compress' reaches this file size, such as 500kB.
         surface_points: start with points on surfaces that photos show, beside those of the scene, up to the budget.
-        virtual_views: train runs of at least 3,000 steps (2,000 on photos of 1.7 megapixels) on 2 to 30 photos also
+        virtual_views: train runs of at least 3,000 steps (2,000 on photos of 1.7 megapixels) on 2 to 16 photos also
             on virtual views: the mean render of three short runs at viewpoints between the photos.
         log2_table_size: rows per level of the hash grid: 2^B.
         background: train a background sphere. Default: by preset.

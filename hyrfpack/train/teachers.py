@@ -31,7 +31,7 @@ from hyrfpack.train.virtual_views import render_virtual_views
 _LOG = logging.getLogger(__name__)
 
 TEACHER_STEPS = 1_000
-MAX_TAUGHT_PHOTOS = 30
+MAX_TAUGHT_PHOTOS = 16  # With 25 photos, one set loses (docs/research/few-photos.md).
 MIN_TAUGHT_PHOTOS = 2  # Virtual views lie between two cameras.
 TEACHER_TASK_PREFIX = "teacher run"
 

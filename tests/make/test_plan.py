@@ -81,8 +81,8 @@ def test_few_photos_take_time_for_teacher_runs():
         plan = Plan(steps, max_size=1600)
         return estimate_photos_seconds(count, expected_photo_size((side, side), 1600), plan, CPU_DEVICE)["teachers"]
 
-    assert 0 < seconds(34) < seconds(34, 1600)
-    assert seconds(34, steps=1_999) == seconds(36) == 0
+    assert 0 < seconds(18) < seconds(18, 1600)
+    assert seconds(18, steps=1_999) == seconds(20) == 0
 
 
 @pytest.mark.parametrize("sizes", [[(480, 320)], [(900, 600), (640, 480), (1201, 799)], [(1600, 1066), (1600, 1200)]])
