@@ -106,16 +106,21 @@ class PictureIndex:
         """
         wanted_names = list(dict.fromkeys(names))
         found = {name: path for name in wanted_names if (path := self._find_exact(name)) is not None}
-        taken = set(found.values())
-        completed = {name: self._find_with_extension(name) for name in wanted_names if name not in found}
-        completed = {name: [file for file in files if file not in taken] for name, files in completed.items()}
+        ambiguous: set[str] = set()
+
+        def apply(rule: Callable[[str], list[Path]]) -> dict[str, list[Path]]:
+            """Apply a rule to the names that are left; return the files that each may refer to and no other has."""
+            known, taken = {*found, *ambiguous}, set(found.values())
+            return {
+                name: [file for file in rule(name) if file not in taken] for name in wanted_names if name not in known
+            }
+
+        completed = apply(self._find_with_extension)
         found |= {name: files[0] for name, files in completed.items() if len(files) == 1}
         exact = set(found)
-        ambiguous = {name for name, files in completed.items() if len(files) > 1}
+        ambiguous |= {name for name, files in completed.items() if len(files) > 1}
         for rule in () if len(found) + len(ambiguous) == len(wanted_names) else self._rules:
-            fits = {name: rule(name) for name in wanted_names if name not in found and name not in ambiguous}
-            taken = set(found.values())
-            fits = {name: [file for file in files if file not in taken] for name, files in fits.items()}
+            fits = apply(rule)
             claims = Counter(file for files in fits.values() for file in files)
             for name, files in fits.items():
                 if len(files) == 1 and claims[files[0]] == 1:

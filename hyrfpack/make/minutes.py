@@ -141,10 +141,11 @@ class SceneCost:
         If teacher runs leave no time for the usual number of steps, the plan has more steps in their place.
         """
         plan = dataclasses.replace(self.requested, steps=self.max_steps_within(scene, seconds))
-        alone = dataclasses.replace(self, requested=dataclasses.replace(self.requested, virtual_views=False))
-        if self.teacher_seconds(scene, plan.steps) or (steps := alone.max_steps_within(scene, seconds)) == plan.steps:
+        if self.teacher_seconds(scene, plan.steps):
             return plan
-        return dataclasses.replace(alone.requested, steps=steps)
+        without = dataclasses.replace(self.requested, virtual_views=False)
+        steps = dataclasses.replace(self, requested=without).max_steps_within(scene, seconds)
+        return dataclasses.replace(without, steps=steps) if steps > plan.steps else plan
 
 
 def fit_plan_to_minutes(

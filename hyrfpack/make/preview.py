@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+from hyrfpack.atomic import remove_if_possible
 from hyrfpack.compress import compress_model
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
@@ -23,16 +23,14 @@ _UNCOMPRESSED_FILE = "preview.raw.hyrf"
 
 def remove_preview(stage_cache: StageCache) -> None:
     """Remove the preview of an earlier call, if there is one."""
-    with suppress(OSError):
-        (stage_cache.folder / PREVIEW_FILE).unlink(missing_ok=True)
+    remove_if_possible(stage_cache.folder / PREVIEW_FILE)
 
 
 def write_preview(stage_cache: StageCache, trainer: Trainer, context: RunContext) -> Path | None:
     """Compress the model of an interrupted run into `preview.hyrf` in the work folder.
 
-    An interrupted run has trained at a lower resolution and has more Gaussians than at its end; a finished teacher run
-    has not. A preview of more steps, which an earlier call has left, is kept. The checkpoint stays, so the run can be
-    resumed.
+    The model of an interrupted run was trained at a lower resolution and has more Gaussians than at the end. A preview
+    that an earlier call has left is kept if it has more steps. The checkpoint stays, so the run can be resumed.
 
     Args:
         stage_cache: the stages of the pipeline.
@@ -59,8 +57,7 @@ def write_preview(stage_cache: StageCache, trainer: Trainer, context: RunContext
     except KeyboardInterrupt:
         return None
     finally:
-        with suppress(OSError):
-            uncompressed.unlink(missing_ok=True)
+        remove_if_possible(uncompressed)
     return target
 
 

@@ -2,6 +2,8 @@
 
     python -m tools.studies.virtual_views --sets drone_caliterra@12 gerrard_hall@12 --seeds 0 1
 
+Set and steps must be ones with virtual views (`hyrfpack.train.teachers.count_teachers`).
+
 A variant (`set_variants.py`) is trained on all of its photos, and scored on up to 24 other training photos of the full
 set. A full set is trained on three of four training photos and scored on up to 8 others. Held-out photos are not used.
 Cells have plain PSNR in dB and SSIM of the raw model, the change by virtual views, and CPU seconds of both runs with
@@ -99,7 +101,7 @@ def main() -> None:
                 steps=args.steps, seed=seed, exposure=not scene.has_alpha, budget_factor=1.0, early_stop=False
             )
             if not count_teachers(len(scene.train), PhotoSize.of_views(scene.train), config):
-                parser.error(f"{name} has too many photos for virtual views, or a run on them takes more steps")
+                parser.error(f"{name}: runs of {args.steps:,} steps on {len(scene.train)} photos have no virtual views")
             scores = []
             for virtual_views in (False, True):
                 score = train_and_score(scene, validation, dataclasses.replace(config, virtual_views=virtual_views))
