@@ -42,8 +42,9 @@ from hyrfpack.scene import Scene
 from hyrfpack.splats.files import list_source_files
 from hyrfpack.train import Trainer, train_model
 from hyrfpack.train.decisions import measures_length
+from hyrfpack.train.resolution import PhotoSize
 from hyrfpack.train.run import is_begun
-from hyrfpack.train.teachers import TEACHER_TASK_PREFIX
+from hyrfpack.train.teachers import TEACHER_STEPS, TEACHER_TASK_PREFIX, count_teachers
 
 _LOG = logging.getLogger(__name__)
 
@@ -126,11 +127,7 @@ def run_training_stage(
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
         if not (resuming and _is_run_finished(run)):
-            at_most = "at most " if measures_length(scene, config) else ""
-            _LOG.info(
-                f"training: {at_most}{format_count(plan.steps, 'step')} on {format_count(len(scene.train), 'photo')}, "
-                f"{len(scene.test)} held out; on {describe_device(context.choose_device())}"
-            )
+            _LOG.info(f"training: {describe_runs(scene, config)}; on {describe_device(context.choose_device())}")
             resume = resuming and is_begun(run)
             if not resume:
                 remove_preview(stage_cache)  # it shows other photos or settings
@@ -138,6 +135,16 @@ def run_training_stage(
         return _read_training_facts(run, config), [f"{RUN_FOLDER}/{name}" for name in (MODEL_FILE, METRICS_FILE)]
 
     return stage_cache.run_stage("training", inputs, execute, {name: getattr(config, name) for name in FIXED_SETTINGS})
+
+
+def describe_runs(scene: Scene, config: TrainConfig) -> str:
+    """Describe the training of a scene in words: its teacher runs, if it has any, its steps and photos."""
+    photos = len(scene.train)
+    teachers = count_teachers(photos, PhotoSize.of_views(scene.train), config)
+    before = f"{teachers} teacher runs of {format_count(TEACHER_STEPS, 'step')}, then " if teachers else ""
+    at_most = "at most " if measures_length(scene, config) else ""
+    steps = f"{at_most}{format_count(config.steps, 'step')}"
+    return f"{before}{steps} on {format_count(photos, 'photo')}, {len(scene.test)} held out"
 
 
 def _train(

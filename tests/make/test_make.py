@@ -16,6 +16,7 @@ from PIL import Image
 
 from hyrfpack import load_model, load_scene
 from hyrfpack.config.make import MakeConfig
+from hyrfpack.config.train import TrainConfig
 from hyrfpack.context import RunContext
 from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError
@@ -67,6 +68,13 @@ def test_teacher_runs_are_a_part_of_the_training_between_pilot_runs_and_steps():
     for event, share in zip(events, (5, 15, 15, 45), strict=True):
         shown.report_event(event)
         assert messages[-1].share == pytest.approx(share / 60)
+
+
+@pytest.mark.parametrize(
+    ("steps", "start"), [(2_999, "2,999 steps on "), (3_000, "3 teacher runs of 1,000 steps, then 3,")]
+)
+def test_the_description_of_the_training_names_teacher_runs(steps, start, posed):
+    assert stages.describe_runs(load_scene(posed), TrainConfig(steps)).startswith(start)
 
 
 def test_scoring_after_the_last_step_is_part_of_the_training_progress():
