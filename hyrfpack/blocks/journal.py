@@ -125,6 +125,16 @@ def is_begun(out: Path) -> bool:
     return (out / BLOCKS_JOURNAL_FILE).is_file()
 
 
+def read_grid(out: Path) -> str:
+    """Return the grid of the run in a folder, as "2x3".
+
+    Raises:
+        HyrfError: there is no run in blocks, or its journal is damaged.
+    """
+    journal = _read_journal(out / BLOCKS_JOURNAL_FILE)
+    return str(journal.settings.get("blocks"))
+
+
 def _read_journal(path: Path) -> Journal:
     """Read a journal.
 

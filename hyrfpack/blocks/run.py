@@ -17,7 +17,7 @@ import torch
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.blocks.cells import ground_axes, ground_extent
-from hyrfpack.blocks.journal import Journal, is_begun, open_journal
+from hyrfpack.blocks.journal import Journal, is_begun, open_journal, read_grid
 from hyrfpack.blocks.merge import merge_blocks
 from hyrfpack.blocks.plan import MIN_BLOCK_PHOTOS, Block, BlockPlan, parse_grid, plan_blocks
 from hyrfpack.checks import check_type
@@ -38,13 +38,15 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.parallel.ranks import SINGLE_PROCESS, Ranks
 from hyrfpack.progress import Progress, TaskEvent, items_of_progress
 from hyrfpack.scene import Scene
-from hyrfpack.train.checkpoint import saved_decisions
+from hyrfpack.train.checkpoint import names_and_sizes, saved_decisions
 from hyrfpack.train.checks import check_outputs, check_photos
 from hyrfpack.train.decisions import measures_budget, measures_exposure
+from hyrfpack.train.distributed import check_settings
 from hyrfpack.train.finish import TrainResult
-from hyrfpack.train.results import VIEWS_FOLDER, scene_facts
-from hyrfpack.train.run import Observer, resuming, train_model
+from hyrfpack.train.results import VIEWS_FOLDER, remove_results, scene_facts
+from hyrfpack.train.run import Observer, resuming, train_model, without_resume_hint
 from hyrfpack.train.setup import PACKED_HEADER_BYTES, budget_for, check_target
+from hyrfpack.version import __version__
 
 _LOG = logging.getLogger(__name__)
 
@@ -119,16 +121,21 @@ def train_blocks(
         config = dataclasses.replace(config, preset=detect_preset(scene)[0])
     check_target(scene, config)
     ranks = context.ranks or SINGLE_PROCESS
-    # Machines may differ in their memory, but all processes need the same grid.
-    is_auto = blocks == "auto"
-    columns, rows = ranks.broadcast(choose_grid(scene, config, device, ranks)) if is_auto else parse_grid(blocks)
+    _check_processes(ranks, scene, config, blocks)
+    # This check ignores existing results. It runs first, so that no folder is created where nothing may be written.
+    ranks.run_on_main(lambda: check_outputs(out, scene, overwrite=True))
+    may_resume = resume or ranks.restarts > 0
+    if blocks == "auto":
+        # Machines may differ in their memory, but all processes need the same grid, and a resumed run keeps its own.
+        kept = ranks.run_on_main(lambda: read_grid(out) if may_resume and is_begun(out) else None)
+        blocks = kept or ranks.broadcast("{}x{}".format(*choose_grid(scene, config, device, ranks)))
+    columns, rows = parse_grid(blocks)
     if columns * rows == 1:
         return train_model(
             scene, out, config, resume=resume, overwrite=overwrite, observer=observer, log=log, context=context
         )
     plan = plan_blocks(scene, columns, rows)
-    # This check ignores existing results. It runs first, so that no folder is created where nothing may be written.
-    ranks.run_on_main(lambda: check_outputs(out, scene, overwrite=True))
+    check_settings(ranks, {f"photos of block {block.name}": names_and_sizes(block.photos) for block in plan.blocks})
     with exclusive_folder(out, ranks=ranks):
         resume = ranks.broadcast(resume or (ranks.restarts > 0 and is_begun(out)))
         cache = context.cache or PictureCache(memory_bytes() // 4 // ranks.local_size)
@@ -161,6 +168,12 @@ def train_blocks(
             device=device,
             ranks=ranks,
         ).execute()
+
+
+def _check_processes(ranks: Ranks, scene: Scene, config: TrainConfig, blocks: str) -> None:
+    """Raise HyrfTrainingError unless all processes were started with the same settings, photos and versions."""
+    versions = {"versions": (__version__, torch.__version__)}
+    check_settings(ranks, {"blocks": blocks, **config.to_dict(), "photos": names_and_sizes(scene.views), **versions})
 
 
 def choose_grid(scene: Scene, config: TrainConfig, device: torch.device, ranks: Ranks) -> tuple[int, int]:
@@ -223,8 +236,13 @@ class _BlockRun:
                 time.sleep(POLL_SECONDS)
         if not self.ranks.is_main:
             return TrainResult(True, steps, self.out / MODEL_FILE, {})
-        with self.context.open_progress("blocks", interruptible=False) as progress:
-            return self._merge(progress, overwrite=self.resume or self.overwrite)
+        metrics = [self._read_metrics(block) for block in self.plan.blocks]
+        try:
+            with self.context.open_progress("blocks", interruptible=False) as progress:
+                return self._merge(metrics, progress, overwrite=self.resume or self.overwrite)
+        except HyrfError as error:
+            kept = f"the trained blocks are kept, {resuming(self.overwrite)} merges them"
+            raise error.with_text(fix=f"{error.fix}; {kept}") from error
 
     def _claim(self, block: Block) -> AbstractContextManager[bool]:
         """Keep other processes from training a block in a `with` block, whose value is False if one is at it."""
@@ -255,13 +273,12 @@ class _BlockRun:
                 raise HyrfError(result.missing, fix="free space on the disk")
         except HyrfError as error:
             kept = f"finished blocks are kept, {resuming(self.overwrite)} continues"
-            # The cause says the same, without how to resume a run that has no blocks.
-            plain = error.__cause__ if isinstance(error.__cause__, HyrfError) else error
+            plain = without_resume_hint(error)  # A run without blocks is resumed in another way.
             raise plain.with_text(f"{label}: {plain.problem}", f"{plain.fix}; {kept}") from error
         return result
 
     def _block_config(self, block: Block) -> TrainConfig | None:
-        """Return the settings of a block; None if they are not decided yet.
+        """Return the settings of a block; None if the first block has not written what it decided yet.
 
         A total budget is shared out by the points that photos of blocks show. The pilot runs of the first block decide
         for all blocks.
@@ -292,24 +309,29 @@ class _BlockRun:
         path = self.journal.folder(block.name) / METRICS_FILE
         try:
             metrics = json.loads(path.read_bytes())
-            if not {"settings", "curve", "seconds", "stage_seconds", "gaussians", "log_gains"} <= metrics.keys():
-                raise ValueError
-        except (OSError, ValueError, AttributeError) as error:
+            _check_metrics(metrics)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise HyrfError(
                 f"{path}: the results of a finished block are missing or damaged",
                 fix="train anew with `overwrite=True`",
             ) from error
         return metrics
 
-    def _merge(self, progress: Progress, *, overwrite: bool) -> TrainResult:
-        """Merge the models of all blocks, score the result on the held-out photos, and write `metrics.json`."""
+    def _merge(self, metrics: list[dict], progress: Progress, *, overwrite: bool) -> TrainResult:
+        """Merge the models of all blocks, score the result on the held-out photos, and write `metrics.json`.
+
+        Args:
+            metrics: the content of the `metrics.json` of each block.
+        """
         progress(TaskEvent("merging blocks"))
-        metrics = [self._read_metrics(block) for block in self.plan.blocks]
         models = [self.journal.folder(block.name) / MODEL_FILE for block in self.plan.blocks]
         gains = [{name: np.array(gain) for name, gain in each["log_gains"].items()} for each in metrics]
         target = self.out / MODEL_FILE
         merged = merge_blocks(self.scene, self.plan, models, gains, target, overwrite=overwrite)
+        if overwrite:
+            remove_results(self.out, self.scene)
         content = self._describe(metrics, merged.kept, merged.file.bytes_after)
+        unwritten: list[str] = []
         if self.scene.test:
             model = load_model_or_parts(merged.file.file)
             for part in parts_of(model):
@@ -321,10 +343,14 @@ class _BlockRun:
                 pictures=self.out / VIEWS_FOLDER,
                 overwrite=overwrite,
                 progress=items_of_progress(progress, "scoring held-out photos", len(self.scene.test)),
+                unwritten=unwritten,
             )
             content["evaluation"] = scores.to_dict()
         write_atomic(self.out / METRICS_FILE, json.dumps(content, indent=1).encode(), overwrite=overwrite)
-        return TrainResult(True, content["curve"][-1]["step"], Path(merged.file.file), content)
+        missing = f"{unwritten[0]}; the model is finished, but {VIEWS_FOLDER} is missing" if unwritten else ""
+        if missing:
+            _LOG.warning(missing)
+        return TrainResult(True, content["curve"][-1]["step"], Path(merged.file.file), content, missing)
 
     def _describe(self, metrics: list[dict], kept: list[int], size: int) -> dict[str, Any]:
         """Return the content of the run's `metrics.json` without scores: sums over the blocks."""
@@ -365,3 +391,23 @@ class _BlockRun:
                 for block, each, count in zip(self.plan.blocks, metrics, kept, strict=True)
             ],
         }
+
+
+def _check_metrics(metrics: dict[str, Any]) -> None:
+    """Check what the results of all blocks are put together from; a file of them may be damaged.
+
+    Raises:
+        ValueError, KeyError, TypeError, AttributeError: a value is missing, or is of another type.
+    """
+    settings, curve, gains = metrics["settings"], metrics["curve"], metrics["log_gains"]
+    numbers = [metrics["seconds"], metrics["gaussians"], *metrics["stage_seconds"].values()]
+    numbers += [record[name] for record in curve for name in ("step", "seconds")]
+    numbers += [] if settings["budget_factor"] is None else [settings["budget_factor"]]
+    numbers += [value for gain in gains.values() for value in gain]
+    if not (
+        curve
+        and type(settings["exposure"]) is bool
+        and all(type(number) in (int, float) for number in numbers)
+        and all(len(gain) == 3 for gain in gains.values())
+    ):
+        raise ValueError("a value has another type")

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +31,7 @@ from hyrfpack.data.pictures import (
 )
 from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.scene import Picture
+from hyrfpack.scene import Picture, View
 
 _JPEG_QUALITY = 95
 _PREVIEW_SIZE_PIXELS = (256, 128)  # width and height at which `is_panorama` examines a picture
@@ -127,6 +128,15 @@ def face_size(width: int) -> int:
 def face_lens(size: int) -> Lens:
     """Return the pinhole lens of a face of `size` x `size` pixels, with fields of view of 90 degrees."""
     return Lens(size, size, size / 2, size / 2, size / 2, size / 2)
+
+
+def group_faces(views: Sequence[View]) -> list[list[View]]:
+    """Group views by photo: faces of one panorama are one group, and each other view is one by itself."""
+    groups: dict[str, list[View]] = {}
+    for view in views:
+        photo = f"panorama {view.load.path}" if isinstance(view.load, FaceFile) else f"view {view.name}"
+        groups.setdefault(photo, []).append(view)
+    return list(groups.values())
 
 
 def cut_face(panorama: np.ndarray, face: Face, size: int) -> np.ndarray:

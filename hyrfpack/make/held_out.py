@@ -54,7 +54,7 @@ def score_note(views: int, psnr: float | None, training_psnr: float | None) -> s
     Args:
         views: number of scored held-out photos.
         psnr: their mean PSNR in dB; None if none was scored.
-        training_psnr: mean PSNR of the training photos in dB; None if unknown.
+        training_psnr: PSNR of training photos in dB, as the training's last steps measured it; None if unknown.
     """
     if psnr is None:
         return ""

@@ -129,6 +129,11 @@ class Request:
         """Reject options that exclude each other or do not fit the source."""
         self._check_output_format()
         self._check_settings_fit_source()
+        if self.config.minutes is not None and self.config.quality is not None:
+            raise HyrfError(
+                "a time limit and a quality each decide the number of training steps",
+                fix="give one of them (`minutes` or `quality`)",
+            )
         if self.config.target_bytes is not None and self.config.max_gaussians is not None:
             raise HyrfError(
                 "a target size and a number of Gaussians each decide how large the model is",

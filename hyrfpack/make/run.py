@@ -339,6 +339,7 @@ class _Pipeline:
             "target size": request.config.target_bytes,
             "number of Gaussians": request.config.max_gaussians,
             "preset": request.config.preset,
+            "held-out photos": len(scene.test),
         }
         # A training run that was begun keeps its plan; for another target size, only packing runs again.
         earlier = {**inputs, "target size": stages.trained_target_bytes(self.stage_cache)}

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from hyrfpack.data import load_scene
 from hyrfpack.data.archive import is_archive, unpack
+from hyrfpack.data.equirectangular import group_faces
 from hyrfpack.data.folder import explain_missing_path, list_photos, list_pictures
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
 from hyrfpack.make.held_out import choose_inner_view
@@ -27,7 +28,8 @@ class LoadSettings:
 
     Without `test_every`, every 8th photo is held out (DEFAULT_TEST_EVERY). If there are fewer than MIN_SPLIT_PHOTOS,
     only the photo that is best surrounded by others is held out (`choose_inner_view`). If there are fewer than
-    MIN_HELD_OUT_PHOTOS, none is held out. If the set has a split of its own, that is used instead.
+    MIN_HELD_OUT_PHOTOS, none is held out. If the set has a split of its own, that is used instead. A panorama is one
+    photo, whose faces are held out together.
     """
 
     images: str | None = None
@@ -38,13 +40,16 @@ class LoadSettings:
         """Read photos with poses; `max_size` overrides that of these settings."""
         size = self.max_size if max_size is None else max_size
         read = partial(load_scene, path, images=self.images, max_size=size)
-        scene = read(test_every=DEFAULT_TEST_EVERY if self.test_every is None else self.test_every)
-        if self.test_every is not None or len(scene.views) >= MIN_SPLIT_PHOTOS:
-            return scene
+        if self.test_every is not None:
+            return read(test_every=self.test_every)
         scene = read(test_every=0)
-        if scene.test or len(scene.views) < MIN_HELD_OUT_PHOTOS:
+        photos = group_faces(scene.views)
+        if scene.test or len(photos) < MIN_HELD_OUT_PHOTOS:
             return scene
-        return read(held_out=[choose_inner_view(scene).name])
+        if len(photos) >= MIN_SPLIT_PHOTOS:
+            return read(test_every=DEFAULT_TEST_EVERY)
+        inner = choose_inner_view(scene)
+        return read(held_out=[view.name for photo in photos if inner in photo for view in photo])
 
 
 @dataclass(frozen=True)

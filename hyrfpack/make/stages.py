@@ -43,7 +43,7 @@ from hyrfpack.splats.files import list_source_files
 from hyrfpack.train import Trainer, train_model
 from hyrfpack.train.decisions import measures_length
 from hyrfpack.train.resolution import PhotoSize
-from hyrfpack.train.run import is_begun
+from hyrfpack.train.run import is_begun, without_resume_hint
 from hyrfpack.train.teachers import TEACHER_STEPS, TEACHER_TASK_PREFIX, count_teachers
 
 _LOG = logging.getLogger(__name__)
@@ -120,10 +120,12 @@ def run_training_stage(
         config = replace(config, **stage_cache.state.fixed("training"))
     if config.target_bytes != plan.target_bytes:
         target = "without a target size" if config.target_bytes is None else f"for {config.target_bytes:,} bytes"
-        _LOG.info(
-            f"the trained model is kept: it was trained {target}, and only the compression is repeated; name another "
-            "work folder (`work`) to train it again"
+        kept = (
+            f"the trained model is kept: it was trained {target}, and only the compression is repeated"
+            if stage_cache.state.facts("training", inputs) is not None
+            else f"the training that was begun {target} is resumed, and only the compression has the new target size"
         )
+        _LOG.info(f"{kept}; name another work folder (`work`) to train again")
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
         if not (resuming and _is_run_finished(run)):
@@ -191,7 +193,7 @@ def _train(
             context=replace(context, progress=progress),
         )  # fmt: skip
     except HyrfError as error:  # the fix of this error refers to the command `train`
-        plain = error.__cause__ if isinstance(error.__cause__, HyrfError) else error
+        plain = without_resume_hint(error)
         if resume and "" not in begun and isinstance(plain, HyrfTrainingError):  # the checkpoint cannot be used
             plain = plain.with_text(fix=f"delete {run} and run the same command again")
         raise plain from None

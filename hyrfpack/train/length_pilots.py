@@ -57,7 +57,7 @@ def measure_length(pilots: ScenePilots, exposure: bool, budget_factor: float | N
     lengths = pilot_lengths(pilots.config.steps)
     fold = pilots.fold(LENGTH_VALIDATION_EVERY)
     if not fold.validation:
-        return lengths[-1], "masks leave no pixel of the validation photos"
+        return lengths[-1], f"{lengths[-1]:,}: masks leave no pixel of the validation photos"
     scores: list[float] = []
     measured: list[str] = []
     for number, length in enumerate(lengths, 1):

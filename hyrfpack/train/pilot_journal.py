@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -113,7 +114,7 @@ def read_scores(folder: Path) -> dict[str, PilotScore]:
         if content["version"] != JOURNAL_VERSION:
             return {}
         return {key: _parse_score(entry) for key, entry in content["scores"].items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return {}
 
 
@@ -128,7 +129,7 @@ def _parse_score(entry: dict[str, Any]) -> PilotScore:
     counts = (score.steps, score.run_steps, score.seed, score.max_gaussians)
     if not (
         isinstance(score.psnr_per_view, list)
-        and all(type(number) in (int, float) for number in numbers)
+        and all(type(number) in (int, float) and math.isfinite(number) for number in numbers)
         and all(type(count) is int for count in counts)
         and type(score.exposure) is bool
     ):

@@ -198,12 +198,16 @@ def save_model(trainer: Trainer, out: Path, progress: Progress, *, overwrite: bo
         with suppress(HyrfError):
             write_atomic(out / RECORD_FILE, record.encode())
     if overwrite:
-        # Results of an earlier run would be mistaken for those of this model.
-        for result in (*_earlier_pictures(out, scene), METRICS_FILE, CURVE_FILE, *_picture_files(scene)):
-            remove_if_possible(out / result)
+        remove_results(out, scene)
     if is_recorded and (overwrite or trainer.saved is not None):
         remove_if_possible(out / CHECKPOINT_FILE)  # This also frees space for the results.
     return record
+
+
+def remove_results(out: Path, scene: Scene) -> None:
+    """Remove results of an earlier run from the folder of a new model, which they would be mistaken for."""
+    for result in (*_earlier_pictures(out, scene), METRICS_FILE, CURVE_FILE, *_picture_files(scene)):
+        remove_if_possible(out / result)
 
 
 def write_results(

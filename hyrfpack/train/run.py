@@ -360,6 +360,12 @@ def resuming(overwrite: bool) -> str:
     return f"the same command with `resume=True`{' instead of `overwrite=True`' if overwrite else ''}"
 
 
+def without_resume_hint(error: HyrfError) -> HyrfError:
+    """Return an error of `train_model` as it was before a hint how to resume the run was added to its fix."""
+    cause = error.__cause__
+    return cause if isinstance(cause, HyrfError) and not isinstance(error, HyrfTrainingError) else error
+
+
 @contextmanager
 def _checkpoint_named_in_errors(trainer: Trainer, overwrite: bool) -> Iterator[None]:
     """Add to the fix of an error of reading or writing that the checkpoint is kept and how to resume from it."""

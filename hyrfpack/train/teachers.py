@@ -31,8 +31,8 @@ from hyrfpack.train.virtual_views import render_virtual_views
 _LOG = logging.getLogger(__name__)
 
 TEACHER_STEPS = 1_000
-MAX_TAUGHT_PHOTOS = 16  # With 25 photos, one set loses (docs/research/few-photos.md).
-MIN_TAUGHT_PHOTOS = 2  # Virtual views lie between two cameras.
+MAX_VIRTUAL_VIEW_PHOTOS = 16  # With 25 photos, one set loses (docs/research/few-photos.md).
+MIN_VIRTUAL_VIEW_PHOTOS = 2  # Virtual views lie between two cameras.
 TEACHER_TASK_PREFIX = "teacher run"
 
 
@@ -47,9 +47,9 @@ def count_teachers(photos: int, size: PhotoSize, config: TrainConfig) -> int:
         size: their size.
         config: settings of the run.
     """
-    are_few = MIN_TAUGHT_PHOTOS <= photos <= MAX_TAUGHT_PHOTOS
-    is_taught = config.virtual_views and are_few and config.steps >= usual_steps(size.pixels)
-    return len(TEACHER_FILES) * is_taught
+    are_few = MIN_VIRTUAL_VIEW_PHOTOS <= photos <= MAX_VIRTUAL_VIEW_PHOTOS
+    has_virtual_views = config.virtual_views and are_few and config.steps >= usual_steps(size.pixels)
+    return len(TEACHER_FILES) * has_virtual_views
 
 
 def describe_virtual_views(count: int) -> str:

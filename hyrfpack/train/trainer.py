@@ -76,7 +76,8 @@ class Trainer:
 
     Attributes:
         steps: number of optimiser steps of the whole run.
-        spacing: distance between the initial Gaussians in local units, see `gaussian_spacing`.
+        spacing: typical distance between neighbours in local units if the usual budget of Gaussians lay where the
+            initial ones are, see `gaussian_spacing`.
         learning_rates: those of `config`, adapted to this spacing (`LearningRates.at_spacing`).
         kind: "pilot run" (`hyrfpack.train.pilots`), "teacher run" (`hyrfpack.train.teachers`), "first look"
             (`hyrfpack.make`), or empty for the run itself.
@@ -296,12 +297,11 @@ class Trainer:
             confirmed += self._confirm_launched(problem)
         if is_acting:
             with add_seconds(self.seconds, "density"):
-                before = self.model.gaussians.positions
                 self.renderer.graphs.clear()  # They hold the addresses of parameters.
                 self.strategy.act(self.step, self.model, self.optimizer)
-                self.resolution.update(self.step, len(self.model))
-                if not self.ranks.is_single and self.model.gaussians.positions is not before:
+                if not self.ranks.is_single:
                     self._synchronize()
+                self.resolution.update(self.step, len(self.model))
         return confirmed
 
     @explain_out_of_memory(OUT_OF_MEMORY_FIX)
@@ -443,9 +443,17 @@ class Trainer:
         yield from shuffled(photos, seed, places[len(mixed) :])
 
     def _synchronize(self) -> None:
-        """Copy the state of rank 0 to all ranks, if their parameters differ after density control."""
-        if len(set(self.ranks.all_gather(digest(self.model.parameters())))) > 1:
-            self._restore(self.ranks.broadcast(self._collect_tensors()))
+        """Copy the state of rank 0 to all ranks, if their parameters differ after density control.
+
+        A rank that had another number of Gaussians drops its own observations.
+        """
+        if len(set(self.ranks.all_gather(digest(self.model.parameters())))) == 1:
+            return
+        self._restore(self.ranks.broadcast(self._collect_tensors()))
+        own = self.strategy.state_dict()
+        observed = self.ranks.broadcast(_copy_to_cpu(own))
+        if any(own[name].shape != value.shape for name, value in observed.items()):
+            self.strategy.load_state_dict({name: torch.zeros_like(value) for name, value in observed.items()})
 
     def _record(self, stats: ConfirmedStep) -> None:
         """Add a record of a step to the training curve if `is_recorded`, unless all of its photo is masked."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
+import os
 import shutil
 
 import numpy as np
@@ -231,6 +233,49 @@ def test_a_stop_before_the_first_step_can_be_resumed(finished, tmp_path):
     assert second.model.read_bytes() == finished[1].model.read_bytes()
 
 
+class _SecondOfTwo(Ranks):
+    """Process 1 of 2, whose process 0 was started with one step more."""
+
+    def all_gather(self, item):
+        return [{**item, "steps": item["steps"] + 1} if item else item, item]
+
+
+def test_processes_that_were_started_with_other_settings_are_refused_before_anything_is_written(tmp_path):
+    context = dataclasses.replace(QUIET_CONTEXT, ranks=_SecondOfTwo(rank=1, size=2, local_rank=1, local_size=2))
+    with pytest.raises(HyrfError, match=r"process 1 of 2 was started with other settings than process 0 \(steps\)"):
+        train_blocks(block_scene(), tmp_path / "run", BLOCK_CONFIG, "2x1", context=context)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_resumed_run_in_automatic_blocks_keeps_its_grid(finished, tmp_path, monkeypatch):
+    shutil.copytree(finished[0], tmp_path / "run")
+    monkeypatch.setattr(run, "choose_grid", lambda *_: pytest.fail("the grid of the run was not kept"))
+    resumed = train_blocks(block_scene(), tmp_path / "run", BLOCK_CONFIG, "auto", resume=True, context=QUIET_CONTEXT)
+    assert resumed.model.read_bytes() == finished[1].model.read_bytes()
+
+
+def test_results_of_an_earlier_run_do_not_lie_beside_the_merged_model(finished, tmp_path):
+    shutil.copytree(finished[0], tmp_path / "run")
+    (tmp_path / "run" / "curve.png").write_bytes(b"of a run without blocks")
+    train_blocks(block_scene(), tmp_path / "run", BLOCK_CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"model.hyrf", "metrics.json", "views", "blocks"}
+
+
+def test_a_picture_that_cannot_be_written_is_a_missing_result_of_the_run(finished, tmp_path, monkeypatch):
+    shutil.copytree(finished[0], tmp_path / "run")
+    move = os.replace
+
+    def refuse_pictures(source: str, target: str) -> None:
+        if str(target).endswith(".png"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        move(source, target)
+
+    monkeypatch.setattr("hyrfpack.atomic.os.replace", refuse_pictures)
+    result = train_blocks(block_scene(), tmp_path / "run", BLOCK_CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
+    assert result.complete and "the model is finished, but views is missing" in result.missing
+    assert (tmp_path / "run" / "metrics.json").is_file()
+
+
 @pytest.mark.parametrize("content", ["{", "[]", "{}"])
 @pytest.mark.parametrize("file", ["blocks.json", "1-1/metrics.json"])
 def test_a_damaged_journal_or_result_of_a_block_is_one_clear_error(finished, tmp_path, file, content):
@@ -238,6 +283,18 @@ def test_a_damaged_journal_or_result_of_a_block_is_one_clear_error(finished, tmp
     shutil.copytree(finished[0], run)
     (run / "blocks" / file).write_text(content)
     with pytest.raises(HyrfError, match=r"damaged; train anew with `overwrite=True`"):
+        train_blocks(block_scene(), run, BLOCK_CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("curve", []), ("settings", {}), ("log_gains", [1]), ("seconds", "1"), ("stage_seconds", None)]
+)
+def test_a_damaged_value_in_the_results_of_a_block_is_one_clear_error(finished, tmp_path, name, value):
+    run = tmp_path / "run"
+    shutil.copytree(finished[0], run)
+    path = run / "blocks" / "1-1" / "metrics.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), name: value}))
+    with pytest.raises(HyrfError, match=r"damaged; train anew with `overwrite=True`$"):
         train_blocks(block_scene(), run, BLOCK_CONFIG, "2x1", resume=True, context=QUIET_CONTEXT)
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from hyrfpack.data import load_scene
 from hyrfpack.data.equirectangular import CUBE_FACES, cut_face, cut_panorama, face_lens, face_size, is_panorama
 from hyrfpack.data.masks import assign_masks
 from hyrfpack.errors import HyrfDataError
+from hyrfpack.make.source import LoadSettings
 
 
 def sky_colors(directions: np.ndarray) -> np.ndarray:
@@ -255,6 +257,25 @@ def test_whole_panoramas_are_held_out(tmp_path):
     scene = load_scene(tmp_path, test_every=2)
 
     assert {view.name[0] for view in scene.train} == {"b"} and {view.name[0] for view in scene.test} == {"a"}
+
+
+@pytest.mark.parametrize(("count", "held_out"), [(1, 0), (7, 0), (8, 1), (16, 2)])
+def test_for_a_scene_of_few_photos_a_panorama_counts_as_one_and_is_held_out_whole(tmp_path, count, held_out):
+    write_posed_panoramas(tmp_path, 64)
+    table = json.loads((tmp_path / "transforms.json").read_text())
+    table["frames"] = []
+    for number in range(count):
+        shutil.copy(tmp_path / "images" / "a.png", tmp_path / "images" / f"{number:02d}.png")
+        pose = np.eye(4)
+        pose[0, 3] = number
+        table["frames"].append({"file_path": f"images/{number:02d}.png", "transform_matrix": pose.tolist()})
+    (tmp_path / "transforms.json").write_text(json.dumps(table))
+
+    scene = LoadSettings().load(tmp_path)
+
+    photos = {view.name[:2] for view in scene.test}
+    assert len(photos) == held_out and len(scene.test) == 6 * held_out and len(scene.views) == 6 * count
+    assert photos.isdisjoint(view.name[:2] for view in scene.train)
 
 
 @pytest.mark.parametrize("test_every", [0, 8])

@@ -237,15 +237,27 @@ def test_a_stopped_training_resumes_unchanged_with_another_target_size(posed, tm
                 make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(target_bytes=target))
     assert [config.target_bytes for config in configs] == [30_000, 30_000]
     result = make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(target_bytes=50_000))
-    assert result.training["target_bytes"] == 30_000 and any(
-        "for 30,000 bytes" in sentence for sentence in caplog.messages
-    )
+    assert result.training["target_bytes"] == 30_000
+    assert any("the training that was begun for 30,000 bytes is resumed" in sentence for sentence in caplog.messages)
 
 
-def test_with_minutes_another_target_size_keeps_the_measurement_and_the_training(posed, tmp_path):
+def test_a_time_limit_and_a_quality_are_refused_together(posed, tmp_path):
+    with pytest.raises(HyrfError, match=r"each decide the number of training steps.*`minutes` or `quality`"):
+        make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(minutes=1, quality="draft"))
+    assert not (tmp_path / "scene.work").exists()
+
+
+def test_with_minutes_another_number_of_held_out_photos_is_measured_again(posed, tmp_path):
+    make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(minutes=0.01, test_every=0))
+    result = make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(minutes=0.01, test_every=4), overwrite=True)
+    assert "measurement" not in result.kept
+
+
+def test_with_minutes_another_target_size_keeps_the_measurement_and_the_training(posed, tmp_path, caplog):
     make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(minutes=0.01, target_bytes=30_000))
     result = make_scene(posed, tmp_path / "scene.hyrf", MakeConfig(minutes=0.01, target_bytes=50_000), overwrite=True)
     assert result.kept == ("measurement", "training")
+    assert any("model is kept: it was trained for 30,000 bytes" in sentence for sentence in caplog.messages)
 
 
 def test_a_work_folder_of_an_earlier_version_is_trained_again_once(finished_work, posed, tmp_path, caplog):

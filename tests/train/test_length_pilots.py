@@ -63,7 +63,7 @@ def test_photos_without_validation_photos_get_the_whole_run():
     runs = ScenePilots(masked, TrainConfig(steps=7_000), PictureCache(), CPU_DEVICE)
     assert measure_length(runs, exposure=False, budget_factor=None) == (
         7_000,
-        "masks leave no pixel of the validation photos",
+        "7,000: masks leave no pixel of the validation photos",
     )
     assert not runs.scores
 

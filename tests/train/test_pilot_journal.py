@@ -6,6 +6,7 @@ import json
 import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -212,6 +213,7 @@ def test_fields_of_other_types_make_the_file_count_as_damaged(tmp_path_factory, 
     content = value if whole else {"version": 1, "scores": {"key": {**VALID_SCORE, field: value}}}
     (folder / PILOTS_FILE).write_text(json.dumps(content))
     for score in read_scores(folder).values():
+        assert np.isfinite([score.psnr, score.ssim, *score.psnr_per_view]).all()
         assert type(score.steps) is int and type(score.exposure) is bool and isinstance(score.psnr_per_view, list)
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from hyrfpack.errors import HyrfTrainingError
 from hyrfpack.model import HybridModel
 from hyrfpack.model.gaussians import Gaussians
+from hyrfpack.parallel.ranks import Ranks
 from hyrfpack.render import Rendering
 from hyrfpack.scene import Camera
 from hyrfpack.train import Strategy, TrainConfig, Trainer
@@ -86,3 +87,33 @@ def test_a_run_does_not_resume_with_another_strategy(tmp_path):
     trainer.run(checkpoint=tmp_path / "checkpoint", stop=lambda: trainer.step == 2)
     with pytest.raises(HyrfTrainingError, match=r"other settings \(strategy\)"):
         make_trainer(None).load(tmp_path / "checkpoint")
+
+
+class _BesideAnother(Ranks):
+    """Process 1 of 2, which differs from process 0 and receives what that one holds."""
+
+    def all_gather(self, item):
+        return ["digest of process 0", item]
+
+    def broadcast(self, item):
+        return {name: self.main[name] for name in item} if set(item) <= set(self.main) else self.main
+
+
+def test_a_process_whose_gaussians_differ_gets_those_of_process_0_and_sums_that_fit_them():
+    main, other = make_trainer(None), make_trainer(None)
+    keep = torch.arange(len(main.model))[:-7]
+    nothing = {name: getattr(main.model.gaussians, name)[:0] for name in Gaussians.PARAMETER_NAMES}
+    main.optimizer.replace_gaussians(keep, nothing)
+    main.strategy.load_state_dict({name: value[keep] for name, value in main.strategy.state_dict().items()})
+    ranks = _BesideAnother(rank=1, size=2, local_rank=1, local_size=2)
+    object.__setattr__(ranks, "main", {**main._collect_tensors(), **main.strategy.state_dict()})
+    other.ranks = ranks
+
+    other._synchronize()
+
+    assert all(torch.equal(a, b) for a, b in zip(other.model.parameters(), main.model.parameters(), strict=True))
+    sums = other.strategy.state_dict()
+    assert {name: len(value) for name, value in sums.items()} == dict.fromkeys(sums, len(keep))
+    assert not any(value.any() for value in sums.values())
+    other.ranks = main.ranks
+    other.run()  # takes all steps with the sums

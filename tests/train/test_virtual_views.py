@@ -23,7 +23,7 @@ from hyrfpack.train import TrainConfig, Trainer, teachers, train_model
 from hyrfpack.train.exposure_map import fit_exposure_map
 from hyrfpack.train.resolution import PhotoSize
 from hyrfpack.train.run import is_begun
-from hyrfpack.train.teachers import MAX_TAUGHT_PHOTOS, count_teachers
+from hyrfpack.train.teachers import MAX_VIRTUAL_VIEW_PHOTOS, count_teachers
 from hyrfpack.train.virtual_views import render_virtual_views
 
 TAUGHT_CONFIG = TrainConfig(steps=10, max_gaussians=60, exposure=False)
@@ -112,10 +112,10 @@ def test_virtual_views_of_large_photos_are_smaller():
 @pytest.mark.parametrize(
     ("photos", "size", "steps", "expected"),
     [
-        (MAX_TAUGHT_PHOTOS, SMALL_PHOTOS, 3_000, 3),
+        (MAX_VIRTUAL_VIEW_PHOTOS, SMALL_PHOTOS, 3_000, 3),
         (2, SMALL_PHOTOS, 3_000, 3),
         (1, SMALL_PHOTOS, 3_000, 0),
-        (MAX_TAUGHT_PHOTOS + 1, SMALL_PHOTOS, 3_000, 0),
+        (MAX_VIRTUAL_VIEW_PHOTOS + 1, SMALL_PHOTOS, 3_000, 0),
         (8, SMALL_PHOTOS, 2_999, 0),
         (8, LARGE_PHOTOS, 2_000, 3),
         (8, LARGE_PHOTOS, 1_999, 0),
