@@ -121,10 +121,12 @@ class MergedPacker:
         return EncodedCandidate(encode_parts(parts), sums)
 
     def decode(self, candidate: EncodedCandidate) -> HybridModel | MergedModel:
-        """Decode a file."""
+        """Decode a file, on the device and at the precision of the models."""
         model = decode_parts(read_container(candidate.data, SECTION_CONTENTS))
         device = self.packers[0].model.gaussians.positions.device
         assert isinstance(model, MergedModel)
+        for part, packer in zip(model.parts, self.packers, strict=True):
+            part.precision = packer.model.precision
         return model.to(device)
 
 

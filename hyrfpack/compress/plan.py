@@ -67,7 +67,11 @@ def make_plan(model: HybridModel, sensitivity: Sensitivity, distortion: float, p
 
 
 def distortion_per_number(model: HybridModel, distortion: float) -> float:
-    """Return D, the mean squared error of pictures that each number of a model may add."""
+    """Return D, the mean squared error of pictures that each number of a model may add.
+
+    The residuals of imported Gaussians are not counted, so their errors add to the distortion. Imports choose the
+    distortion by measured errors.
+    """
     return distortion / sum(parameter.numel() for parameter in model.parameters())
 
 

@@ -152,8 +152,9 @@ def _compress_merged(
     def compress_part(loose: Path, packed: Path, progress: Progress) -> None:
         nonlocal photos
         own, photos = photos, None
-        if config.profile == "compact" and not describe_file(loose)["gaussians"]:
-            copy_file(loose, packed)  # nothing can be measured of a scene that is all background
+        facts = describe_file(loose)
+        if config.profile == "compact" and not facts["gaussians"] and not facts["config"]["background"]:
+            copy_file(loose, packed)  # nothing can be measured of a solid colour
         else:
             _compress_single(loose, packed, config, own, True, replace(context, progress=progress))
 
@@ -238,9 +239,9 @@ def _prepare_packer(
         check_target_bytes(config.target_bytes, kept, model.exposure)
     model = model.to(context.choose_device())
     model.precision = "float32"  # quantisation errors are smaller than the rounding of lower precisions on a GPU
-    if len(model) == 0:
+    if len(model) == 0 and not model.config.background:
         raise HyrfError(
-            f"{source}: there is no Gaussian in it, so there is nothing to measure",
+            f"{source}: there is no Gaussian in it and no background, so there is nothing to measure",
             fix="use profile 'paper'",
         )
     capture = Capture(describe_file(source), data)
@@ -254,7 +255,7 @@ def _prepare_packer(
     )
     # The model of a uniform wall or sky may be all background, at cameras that are known to be its own.
     has_own_cameras = data is None or ("cameras" in provenance and not capture.mismatch)
-    if not sensitivity.is_seen and not (model.config.background and has_own_cameras):
+    if len(model) and not sensitivity.is_seen and not (model.config.background and has_own_cameras):
         raise HyrfError(
             f"{source}: none of its {len(cameras)} cameras sees a Gaussian, so there is nothing to measure",
             fix="name photos that show the model with `data`, or use profile 'paper'",

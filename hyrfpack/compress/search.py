@@ -36,7 +36,7 @@ def find_coarsest(
         make_trial: makes the trial of a distortion; if a trial fits, those of smaller distortions fit too.
         fits: returns whether a trial is good enough.
         start: distortion of the first trial.
-        trials: maximum number of trials, at least 2.
+        trials: maximum number of trials, at least 2. If none of them fits, the smallest distortion is tried, too.
         bounds: smallest and largest distortion.
 
     Returns:
@@ -83,7 +83,8 @@ def find_fullest(
     Args:
         size: returns the bytes of a trial; a larger distortion never takes more bytes.
         limit: maximum size in bytes.
-        make_trial, start, trials, bounds: as for `find_coarsest`.
+        make_trial, start, bounds: as for `find_coarsest`.
+        trials: maximum number of trials. If none of them fits, the largest distortion is tried, too.
 
     Returns:
         The distortion and the largest trial that fits; if none does, the largest distortion and its trial.

@@ -16,8 +16,8 @@ MAX_IMPORT_PSNR_DB = 60
 class ImportConfig:
     """Settings that, with the splats, determine the result of an import.
 
-    Compression is decided at `views` sampled viewpoints and measured at others; `test_views` further ones score the
-    file.
+    Sensitivities are measured at `views` sampled viewpoints, and compression is decided at others, three times
+    `test_views`; `test_views` further ones score the file.
 
     Attributes:
         psnr: PSNR of renders of FILE against renders of SOURCE; more dB take more bytes. Default: 37

@@ -34,6 +34,7 @@ from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.part_names import open_parts
 from hyrfpack.format.parts import decode_parts
 from hyrfpack.format.sections import PART_NAMES, SECTION_CONTENTS
+from hyrfpack.format.shared import read_provenance
 from hyrfpack.model import HybridModel
 from hyrfpack.model.merged import MergedModel, map_parts, parts_of
 from hyrfpack.progress import Progress
@@ -84,7 +85,7 @@ class Edit:
         source: the file as messages name it.
         before, after: the scene before the first action and after the last one.
         reports: what each action has done.
-        parts: the models of the file that have Gaussians after the last action, in order.
+        parts: the models of the file in order, without those whose last Gaussian an action has removed.
         data: photos of the scene in the coordinates of the file, or None.
     """
 
@@ -124,14 +125,15 @@ def open_scene(path: Path, source: Path, data: Scene | None, progress: Progress)
     with Container.open(path, SECTION_CONTENTS) as container:
         files = open_parts(container) if PART_NAMES in container.entries else [("", container)]
         model, metadata = decode_parts(container), [read_metadata(part) for _, part in files]
+        provenances = [read_provenance(part) for _, part in files]
     if not len(model):
         raise HyrfError(f"{source}: there is no Gaussian in it, so there is nothing to edit", fix="train it again")
     parts = [
-        EditedPart(name, facts.profile, facts.provenance, part, part)
-        for (name, _), facts, part in zip(files, metadata, parts_of(model), strict=True)
+        EditedPart(name, facts.profile, provenance, part, part)
+        for (name, _), facts, provenance, part in zip(files, metadata, provenances, parts_of(model), strict=True)
     ]
     captures = {
-        part.name: Capture({"config": facts.config, "provenance": facts.provenance})
+        part.name: Capture({"config": facts.config, "provenance": part.provenance})
         for part, facts in zip(parts, metadata, strict=True)
     }
     scene = parts[0]
@@ -219,7 +221,7 @@ def _keep_gaussians(keep: np.ndarray, state: EditState) -> EditState:
     )
     if not isinstance(kept, MergedModel):
         return replace(state, model=kept)
-    remaining = kept.without_empty_parts()
+    remaining = kept.without_emptied_parts(parts_of(state.model))
     for name in kept.names:
         if name not in remaining.names:
             _LOG.info(f"part '{name}' has no Gaussian left and is left out")

@@ -22,6 +22,7 @@ from hyrfpack.model import BACKGROUND_RADIUS, Frame, HybridModel
 from hyrfpack.model.exposure import apply_exposure_gains
 from hyrfpack.ops.background import pixel_directions, sphere_points
 from hyrfpack.ops.poses import camera_center
+from hyrfpack.ops.rasterize.reference import ALPHA_MAX
 from hyrfpack.ops.shade import encode_directions
 from hyrfpack.ops.viewport import Viewport
 from hyrfpack.parallel.pool import torch_on_one_thread
@@ -42,7 +43,6 @@ UNSEEN_COLOR_WEIGHT = 1e-6
 MIN_SPLAT_BUDGET = 1000
 SPLAT_BUDGET_PER_GAUSSIAN = 0.1
 MIN_DIVIDED_COLOR_STD = 1 / 512  # half a step of 8-bit colours
-SPLAT_OPACITY = 0.99  # the limit of the rasteriser
 SPLAT_SCALE_PER_CELL_SIDE = 0.7
 # Ratio of each level's radius to that of the next finer level, so that finer splats are drawn over coarser ones.
 RADIUS_RATIO_PER_LEVEL = 1.1
@@ -107,7 +107,7 @@ def make_background_splats(
         frame.to_world(directions * radii[:, None]),
         np.repeat(scales[:, None], 3, axis=1),  # round, so that a splat looks like a circle from everywhere
         np.tile((1.0, 0.0, 0.0, 0.0), (count, 1)),
-        np.full(count, SPLAT_OPACITY),
+        np.full(count, ALPHA_MAX),
         ((colors - 0.5) / SH_C0)[:, None],
         model.config.antialiased,
     )

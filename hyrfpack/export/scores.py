@@ -12,6 +12,7 @@ from hyrfpack.export.baked_scene import BakedScene, SplatsWithBackground
 from hyrfpack.export.measure import PsnrScores, measure_psnr
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
+from hyrfpack.measure.psnr import mse_from_psnr
 from hyrfpack.progress import Progress, part_of_progress
 from hyrfpack.splats.table import FORMATS, FileKind
 
@@ -119,5 +120,5 @@ def _estimate_cost_db(baked_scores: PsnrScores, file_scores: PsnrScores, model_m
     """
     if baked_scores.photos is not None and file_scores.photos is not None:
         return baked_scores.photos - file_scores.photos
-    file_mse, baked_mse = (10 ** (-scores.model / 10) for scores in (file_scores, baked_scores))
+    file_mse, baked_mse = (mse_from_psnr(scores.model) for scores in (file_scores, baked_scores))
     return 10 * math.log10((model_mse + file_mse) / (model_mse + baked_mse))

@@ -165,8 +165,8 @@ def load_model(
 ) -> HybridModel:
     """Read a model from a `.hyrf` file, from the folder of a training run, or from a scene folder of one model.
 
-    Of a scene folder (`hyrfpack.split_model`), all chunks are read at the finest level, and `fraction` is ignored. The
-    other arguments and the errors are those of `decode_model`.
+    Of a scene folder (`hyrfpack.split_model`), all chunks are read at the finest level; it has no layers, so `fraction`
+    must be None. The other arguments and the errors are those of `decode_model`.
 
     Args:
         path: a `.hyrf` file, the folder of a training run, or a scene folder.
@@ -222,7 +222,7 @@ def packed_provenance(provenance: dict, model: HybridModel) -> dict:
 def load_with_provenance(path: str | os.PathLike[str], fraction: float | None = None) -> tuple[HybridModel, dict]:
     """Read a model and its provenance. The arguments and the errors are those of `load_model`."""
     if is_scene(path):
-        if len(parts := load_parts(path)) > 1:
+        if len(parts := load_parts(path, fraction)) > 1:
             raise HyrfFormatError(
                 f"{path}: this scene holds {len(parts)} merged models, and one model is needed",
                 fix="join its chunks with 'hyrfpack decompress', and take one out with 'hyrfpack edit' and its `part`",
@@ -238,6 +238,11 @@ def load_parts(path: str | os.PathLike[str], fraction: float | None = None) -> l
     The arguments and the errors are those of `load_model`.
     """
     if is_scene(path):
+        if fraction is not None:
+            raise HyrfFormatError(
+                f"{path}: a scene folder has levels in place of layers, so that no fraction of it can be read",
+                fix="leave out `fraction`",
+            )
         scene = SceneFolder(path)
         models, names = parts_of(scene.load()), [part.name for part in scene.manifest.parts]
         return list(zip(names, models, scene.read_provenances(), strict=True))

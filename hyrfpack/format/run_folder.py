@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -186,5 +186,5 @@ def _get_int(values: dict, name: str) -> int | None:
 def _get_finite_number(values: dict, name: str) -> float | None:
     """Return the finite number of this name; None if there is none."""
     value = values.get(name)
-    usable = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    usable = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
     return value if usable else None

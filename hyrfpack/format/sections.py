@@ -58,7 +58,7 @@ SECTION_CONTENTS = {
 
 
 def layer_section(group: str, layer: int) -> str:
-    """Return the section type of a member of LAYERED_SECTIONS in a layer: "POSI", then "POS1", "POS2", ..."""
+    """Return the section type of a group with layers in one of them: "POSI", then "POS1", "POS2", ..."""
     return f"{group[:3]}{layer}" if layer else group
 
 

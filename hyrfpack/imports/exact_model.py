@@ -8,13 +8,12 @@ from hyrfpack.model import HashGridConfig, HybridModel, ModelConfig
 from hyrfpack.model.gaussians import Gaussians, logit
 from hyrfpack.model.hybrid import scale_bounds
 from hyrfpack.model.shape_residuals import compute_shape_residuals
+from hyrfpack.ops.rasterize.reference import ALPHA_MAX
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.harmonics import SH_C0
 
 # Smaller scales, in local units, are raised to this: a quarter of a pixel if the box is 1000 pixels wide.
 MIN_SCALE_LOCAL = 1e-4
-# The rasteriser clamps alpha here, so opacities above it have no gradient.
-MAX_OPACITY = 0.99
 # Colours are clamped to this range before their logits are taken; residuals hold the rest.
 COLOR_RANGE = 0.005, 0.995
 # Fields that are zero everywhere get the smallest hash grid and decoder.
@@ -28,7 +27,7 @@ def exact_model(drawable: Drawable) -> HybridModel:
     """Return a model whose Gaussians equal splats.
 
     Shapes and colours are exact. Scales below MIN_SCALE_LOCAL or above what a model can store, and opacities above
-    MAX_OPACITY, are clamped.
+    ALPHA_MAX, are clamped.
 
     Args:
         drawable: the splats; the model is on their device.
@@ -48,7 +47,7 @@ def exact_model(drawable: Drawable) -> HybridModel:
     shapes, scale_logits = compute_shape_residuals(
         positions.new_zeros(len(positions), FIELD_OUTPUTS), logit(sizes), drawable.quats
     )
-    opacity_logits = logit(drawable.opacities[:, None].clamp_max(MAX_OPACITY))
+    opacity_logits = logit(drawable.opacities[:, None].clamp_max(ALPHA_MAX))
     constant = 0.5 + SH_C0 * harmonics[:, 0]
     color_logits = logit(constant.clamp(*COLOR_RANGE))
     rest = (constant - torch.sigmoid(color_logits)) / SH_C0  # the fields add sigmoid(0 + logit)

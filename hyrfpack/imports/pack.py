@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
@@ -16,6 +15,7 @@ from hyrfpack.compress.packer import Packer
 from hyrfpack.counts import format_count
 from hyrfpack.errors import HyrfSizeError
 from hyrfpack.imports.prepare import PreparedModel
+from hyrfpack.measure.psnr import mse_from_psnr
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress, round_of_progress
 
 _LOG = logging.getLogger(__name__)
@@ -74,13 +74,13 @@ def pack(
     """
     model = prepared.model
     psnrs = np.array(prepared.validation.psnr_per_view(model))
-    allowed, error = _mse(psnr), _mse(psnrs.mean())
+    allowed, error = mse_from_psnr(psnr), mse_from_psnr(psnrs.mean())
     allowance = max(allowed - error, min(FALLBACK_MODEL_ERROR_SHARE * error, FALLBACK_ALLOWED_ERROR_SHARE * allowed))
     _LOG.info(
         f"measuring how each stored number affects renders, at {format_count(len(prepared.cameras), 'camera')} and "
         "between them"
     )
-    distortion = PLANNED_ERROR_SHARE * solve_added_error(_mse(psnrs), error + allowance)
+    distortion = PLANNED_ERROR_SHARE * solve_added_error(mse_from_psnr(psnrs), error + allowance)
     measuring = part_of_progress(progress, 0.0, 0.7)
     sensitivity, _ = measure_calibrated_sensitivity(
         model, prepared.cameras, distortion, progress=measuring, drawn=DRAWN_GAUSSIANS
@@ -101,8 +101,8 @@ def pack(
     def error_ratio(candidate: EncodedCandidate) -> float:
         """Return the larger ratio of an error to its limit: that of the mean, or that of the worst view."""
         scores = prepared.validation.psnr_per_view(packer.decode(candidate))
-        ratio = (_mse(np.mean(scores)) - error) / allowance
-        return ratio if worst is None else max(ratio, _mse(min(scores)) / _mse(worst))
+        ratio = (mse_from_psnr(np.mean(scores)) - error) / allowance
+        return ratio if worst is None else max(ratio, mse_from_psnr(min(scores)) / mse_from_psnr(worst))
 
     return _search(packer, distortion, error_ratio, part_of_progress(progress, 0.7, 1.0)).data
 
@@ -167,8 +167,3 @@ def solve_added_error(errors: np.ndarray, mean: float) -> float:
 
     least = 1e-6 * mean
     return least if excess(least) >= 0 else float(brentq(excess, least, mean, xtol=1e-3 * least))
-
-
-def _mse(psnr: Any) -> Any:
-    """Convert PSNRs in dB to mean squared errors of colours in [0, 1]."""
-    return 10 ** (-psnr / 10)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -20,21 +20,19 @@ from hyrfpack.model import HybridModel
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.scene import Camera, evenly_spaced
 from hyrfpack.splats.draw import Drawable
-from hyrfpack.splats.splats import Splats
+from hyrfpack.splats.splats import Splats, clamp_harmonics
 from hyrfpack.splats.viewpoints import WeightedSplats, has_enclosed_places, sample_viewpoints
 
 _LOG = logging.getLogger(__name__)
 
-# Compression is decided on more views than are scored, because the mean PSNR of few views is off by up to 1 dB.
+# Compression is decided on more views than sampled ones are scored on, because the mean PSNR of few views is off by up
+# to 1 dB.
 VALIDATION_VIEWS_PER_TEST_VIEW = 3
 TEST_EVERY = 8
 LIGHT_MEASUREMENT_VIEWS = 64
 # The faintest Gaussians that together send less than this share of all light are left out. Compression prunes others
 # as the target PSNR allows.
 FAINT_LIGHT_SHARE = 1e-4
-# A colour of this coefficient saturates each pixel in which it weighs 0.004 % or more, so that larger ones hardly
-# change a picture. Sensitivities of far larger ones overflow, and their residuals take too many steps for a file.
-MAX_ABS_HARMONIC = 1e5
 MIN_SHOWN_GAUSSIANS_SHARE = 0.01  # Given cameras that show fewer of the Gaussians belong to another scene.
 
 
@@ -73,7 +71,7 @@ def prepare_model(
         True
     """
     progress(TaskEvent("choosing viewpoints", 0.0))
-    splats = _clamp_harmonics(splats, name)
+    splats = clamp_harmonics(splats, name)
     weighted = WeightedSplats.from_splats(splats, name)
     original = Drawable.from_splats(splats, weighted.frame, device)
     chosen, validation, test = _choose_cameras(weighted, original, config, cameras)
@@ -101,19 +99,6 @@ def prepare_model(
     return PreparedModel(model, chosen, validation_views, test_views)
 
 
-def _clamp_harmonics(splats: Splats, name: str) -> Splats:
-    """Return splats with harmonics of at most MAX_ABS_HARMONIC, and log a warning if some are clamped."""
-    is_clamped = (np.abs(splats.harmonics) > MAX_ABS_HARMONIC).any(axis=(1, 2))
-    if not is_clamped.any():
-        return splats
-    _LOG.warning(
-        f"{name}: harmonics of {is_clamped.sum():,} of {format_count(len(splats), 'Gaussian')} are beyond "
-        f"{MAX_ABS_HARMONIC:,.0f}, as if the file were damaged or its training had failed, and are clamped to it; "
-        "export the file again, or remove such Gaussians"
-    )
-    return replace(splats, harmonics=splats.harmonics.clip(-MAX_ABS_HARMONIC, MAX_ABS_HARMONIC))
-
-
 def _choose_cameras(
     weighted: WeightedSplats, drawable: Drawable, config: ImportConfig, cameras: Sequence[Camera] | None
 ) -> tuple[list[Camera], list[Camera], list[Camera]]:
@@ -137,7 +122,8 @@ def _choose_cameras(
     shrunk = [shrink_camera(camera, config.size) for camera in cameras]
     test = shrunk[::TEST_EVERY]
     measured = [camera for number, camera in enumerate(shrunk) if number % TEST_EVERY] or test
-    return measured, sample_views(measured, config.test_views, config.seed)[1], test
+    validation = sample_views(measured, VALIDATION_VIEWS_PER_TEST_VIEW * config.test_views, config.seed)[1]
+    return measured, validation, test
 
 
 def _indices_without_faint(light: np.ndarray) -> np.ndarray:

@@ -93,7 +93,8 @@ def import_splats(
     The arguments are those of `import_loaded_splats`; `read_splats` describes which files can be read.
 
     Raises:
-        HyrfDataError: the source cannot be read, or the viewpoints show none or less than 1 % of its Gaussians.
+        HyrfDataError: the source cannot be read, the viewpoints show none of its Gaussians, or given ones show less
+            than 1 %.
         HyrfSizeError: no file of this scene is as small as `config.target_bytes`.
         HyrfError: no file at all is that small, or the target cannot be written.
         TypeError: the settings or a camera have the wrong type.
@@ -166,7 +167,7 @@ def import_loaded_splats(
         context: device for rendering, progress and stop.
 
     Raises:
-        HyrfDataError: the viewpoints show none or less than 1 % of the splats.
+        HyrfDataError: the viewpoints show none of the splats, or given ones show less than 1 %.
         HyrfSizeError: no file of this scene is as small as `config.target_bytes`.
         HyrfError: no file at all is that small, the file cannot be written, or the device does not exist.
     """

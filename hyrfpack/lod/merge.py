@@ -15,9 +15,9 @@ from hyrfpack.model import Geometry, HybridModel
 from hyrfpack.model.gaussians import LOGIT_LIMIT, Gaussians, logit
 from hyrfpack.model.residuals import add_shape_residuals, color_differences
 from hyrfpack.model.shape_residuals import compute_shape_residuals
+from hyrfpack.ops.rasterize.reference import ALPHA_MAX
 from hyrfpack.rotations import rotation_matrices
 
-MAX_OPACITY = 0.99
 _BISECTIONS = 40
 
 
@@ -50,7 +50,7 @@ def merge_moments(gaussians: Moments, labels: np.ndarray, count: int) -> Moments
 
         mean = sum m_i p_i / sum m_i      covariance = sum m_i (C_i + (p_i - mean) (p_i - mean)^T) / sum m_i,
 
-    the mean colour, and the opacity sum m_i / area, at most MAX_OPACITY, so that it covers the same area as its
+    the mean colour, and the opacity sum m_i / area, at most ALPHA_MAX, so that it covers the same area as its
     cluster. If all opacities of a cluster are 0, its Gaussians have equal weights.
 
     Args:
@@ -72,7 +72,7 @@ def merge_moments(gaussians: Moments, labels: np.ndarray, count: int) -> Moments
     offsets = gaussians.means - means[labels]
     covariances = average(gaussians.covariances + offsets[:, :, None] * offsets[:, None, :])
     merged = Moments(means, covariances, np.ones(count), average(gaussians.colors))
-    return Moments(means, covariances, np.minimum(total / merged.areas, MAX_OPACITY), merged.colors)
+    return Moments(means, covariances, np.minimum(total / merged.areas, ALPHA_MAX), merged.colors)
 
 
 @torch.no_grad()
@@ -129,7 +129,7 @@ def fit_logits(model: HybridModel, merged: Moments, viewpoints: Sequence[Tensor]
     scales = plain.activate(raw, means, scale_logits, zeros).scales.double()
     # Where the volume cannot be reached, the opacity makes up for the area.
     light = torch.from_numpy(merged.opacities * merged.areas)
-    opacities = (light / scales.prod(dim=1) ** (2 / 3)).clamp(max=MAX_OPACITY)
+    opacities = (light / scales.prod(dim=1) ** (2 / 3)).clamp(max=ALPHA_MAX)
     neural = logit(plain.activate(raw, means, scale_logits, zeros).opacities)
     opacity_logits = (logit(opacities) - neural)[:, None]
     seen, residuals = torch.from_numpy(merged.colors).tensor_split([3 * len(viewpoints)], dim=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,10 +73,18 @@ class MergedModel:
         """Return the model with all parts on a device; parts that are elsewhere are moved in place."""
         return replace(self, parts=tuple(part.to(device) for part in self.parts))
 
-    def without_empty_parts(self) -> MergedModel:
-        """Return the model of the parts that have Gaussians, at least one."""
-        nonempty = [(name, part) for name, part in zip(self.names, self.parts, strict=True) if len(part)]
-        names, parts = zip(*nonempty, strict=True)
+    def without_emptied_parts(self, before: Sequence[HybridModel]) -> MergedModel:
+        """Return the model without the parts that have no Gaussian left.
+
+        Args:
+            before: the parts before Gaussians were removed. One that had none is kept: it shows its background.
+        """
+        kept = [
+            (name, part)
+            for name, part, earlier in zip(self.names, self.parts, before, strict=True)
+            if len(part) or not len(earlier)
+        ]
+        names, parts = zip(*kept, strict=True)
         return MergedModel(names, parts)
 
     def __len__(self) -> int:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hyrfpack.config.render import GeometryConfig
+from hyrfpack.errors import HyrfDataError
 from hyrfpack.model import Frame
 from hyrfpack.ops.harmonics import harmonics_basis
 from hyrfpack.ops.poses import camera_center
@@ -50,9 +51,21 @@ class Drawable:
         """Convert splats to the local units of a frame and copy them to a device.
 
         The frame's rotation is ignored: the axes remain those of the world, as the splats' harmonics need them.
+
+        Raises:
+            HyrfDataError: a position is too large for float32 in these units.
         """
         frame = replace(frame, rotation=IDENTITY)
-        positions = frame.to_local(splats.positions).astype(np.float32)
+        with np.errstate(over="ignore"):
+            positions = frame.to_local(splats.positions).astype(np.float32)
+        is_near = np.isfinite(positions).all(axis=1)
+        if not is_near.all():
+            x, y, z = splats.positions[~is_near][0].tolist()
+            raise HyrfDataError(
+                f"the Gaussian at ({x:.3g}, {y:.3g}, {z:.3g}) is too far from the others, in units of their extent "
+                f"({frame.scale:.3g})",
+                fix="remove it from the file",
+            )
         scales = splats.scales / np.float32(frame.scale)
         arrays = positions, scales, splats.quats, splats.opacities, splats.harmonics
         means, sizes, quats, opacities, harmonics = (torch.from_numpy(array).to(device) for array in arrays)

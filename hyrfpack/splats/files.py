@@ -80,7 +80,7 @@ def _read_any_splats(path: Path) -> Splats:
         return FORMATS[extension].decode(data, str(path))
     except OSError as error:
         raise HyrfDataError(
-            f"{path}: the file cannot be read ({error.strerror or error})",
+            f"{error.filename or path}: the file cannot be read ({error.strerror or error})",
             fix="check the path",
         ) from error
 
@@ -117,7 +117,7 @@ def _read_unbundled_sog(folder: Path) -> dict[str, bytes]:
             f"{_format_names(names)}",
             fix=f"name {(splat_names or level_names)[0]} in it" if splat_names or level_names else default_fix,
         )
-    return {file.name: _read_bytes(file) for file in list_source_files(folder)}
+    return {file.name: _read_bytes(file) for file in list_source_files(folder) if file.name in names}
 
 
 def _may_hold_gaussians(file: Path) -> bool:

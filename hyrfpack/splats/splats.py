@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hyrfpack.counts import format_count
 from hyrfpack.ops.harmonics import MAX_DEGREE, num_sh_bases
 from hyrfpack.rotations import multiply_quats, quaternion_from_matrix
 from hyrfpack.splats.harmonics import SH_C0, compute_harmonics_rotation
+
+_LOG = logging.getLogger(__name__)
+
+# A colour of this coefficient saturates each pixel in which it weighs 0.004 % or more, so that larger ones hardly
+# change a picture. Sensitivities of far larger ones overflow, and their residuals take too many steps for a file.
+MAX_ABS_HARMONIC = 1e5
 
 
 @dataclass(frozen=True)
@@ -116,3 +124,16 @@ def normalize_quats(quats: np.ndarray) -> np.ndarray:
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)
     quats = np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1), [1.0, 0.0, 0.0, 0.0])
     return np.where(quats[:, :1] < 0, -quats, quats).astype(np.float32)
+
+
+def clamp_harmonics(splats: Splats, name: str) -> Splats:
+    """Return splats with harmonics of at most MAX_ABS_HARMONIC, and log a warning if some are clamped."""
+    is_clamped = (np.abs(splats.harmonics) > MAX_ABS_HARMONIC).any(axis=(1, 2))
+    if not is_clamped.any():
+        return splats
+    _LOG.warning(
+        f"{name}: harmonics of {is_clamped.sum():,} of {format_count(len(splats), 'Gaussian')} are beyond "
+        f"{MAX_ABS_HARMONIC:,.0f}, as if the file were damaged or its training had failed, and are clamped to it; "
+        "export the file again, or remove such Gaussians"
+    )
+    return replace(splats, harmonics=splats.harmonics.clip(-MAX_ABS_HARMONIC, MAX_ABS_HARMONIC))

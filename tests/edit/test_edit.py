@@ -45,6 +45,7 @@ from hyrfpack.format import describe_file, load_model, save_model
 from hyrfpack.format.codec import load_with_provenance
 from hyrfpack.format.container import Container
 from hyrfpack.render import render_view
+from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
 
 pytestmark = pytest.mark.usefixtures("quick_calibration")
 GOLDEN_FOLDER = Path(__file__).parents[1] / "golden"
@@ -437,3 +438,10 @@ def test_edit_model_checks_its_actions(tmp_path):
         edit_model(COMPACT_FILE, tmp_path / "out.hyrf", [])
     with pytest.raises(TypeError, match="not an action of hyrfpack.config.edit"):
         edit_model(COMPACT_FILE, tmp_path / "out.hyrf", ["crop"])
+
+
+def test_a_chunk_of_a_scene_folder_keeps_the_provenance_of_the_scene(tmp_path):
+    chunk = GOLDEN_SCENE_FOLDER / "chunk-0000-0.hyrf"
+    report = edit_model(chunk, tmp_path / "edited.hyrf", [Translate((1.0, 0.0, 0.0))], context=QUIET_CONTEXT)
+    before, after = (describe_file(path)["provenance"] for path in (chunk, report.file))
+    assert after.keys() == before.keys() | {"placement"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 from pathlib import Path
@@ -44,7 +45,8 @@ from hyrfpack.config.edit import (
 from hyrfpack.edit import edit_model, floaters, merge_models, plan_edit
 from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate.metrics import psnr
-from hyrfpack.format import describe_file, load_merged_model, load_model, save_model
+from hyrfpack.format import describe_file, encode_model, load_merged_model, load_model, save_model
+from hyrfpack.format.codec import load_parts
 from hyrfpack.format.parts import write_parts
 from hyrfpack.render import render_view
 
@@ -188,6 +190,43 @@ def test_a_part_that_is_left_with_nothing_is_left_out_with_a_note(merged, tmp_pa
     assert "part 'room' has no Gaussian left and is left out" in notes
     assert "the cameras of part 'toy'" in notes
     assert load_model(only_toy.file).config.frame == load_merged_model(merged).parts[1].config.frame
+
+
+def write_without_gaussians_in_the_scene(merged: Path, path: Path, **config) -> Path:
+    """Write a file as versions of 2025 left it: its first part shows its background alone."""
+    (name, scene, provenance), *others = load_parts(merged)
+    scene = scene.subset(torch.arange(0))
+    scene.config = dataclasses.replace(scene.config, **config)
+    parts = [(name, encode_model(scene, "raw", provenance))]
+    parts += [(other, encode_model(model, "raw", kept)) for other, model, kept in others]
+    return Path(write_parts(parts, path).file)
+
+
+def test_a_scene_that_is_all_background_stays_in_an_edited_file(merged, tmp_path):
+    hollow = write_without_gaussians_in_the_scene(merged, tmp_path / "hollow.hyrf")
+    edited = edit_model(hollow, tmp_path / "edited.hyrf", [MinOpacity(0.0)], context=QUIET_CONTEXT)
+    moved = edit_model(hollow, tmp_path / "moved.hyrf", [Scale(2.0)], profile="compact", context=QUIET_CONTEXT)
+    for report in (edited, moved):
+        model = load_merged_model(report.file)
+        assert model.names == ("room", "toy") and model.parts[0].config.background
+        assert describe_file(report.file)["provenance"]["viewpoint"] is not None
+
+
+@pytest.mark.parametrize("profile_only", [False, True])
+def test_a_scene_that_is_all_background_is_compressed_with_the_other_parts(merged, tmp_path, profile_only):
+    hollow = write_without_gaussians_in_the_scene(merged, tmp_path / "hollow.hyrf")
+    limit = None if profile_only else hollow.stat().st_size // 2
+    report = compress_model(hollow, tmp_path / "small.hyrf", CompressConfig(target_bytes=limit), context=QUIET_CONTEXT)
+    camera = camera_at((1.5, -2.5, 1.0))
+    renders = [render_view(load_merged_model(path), camera).rgb for path in (hollow, report.file)]
+    assert report.bytes_after < hollow.stat().st_size / 2 and psnr(*renders) > 30
+
+
+def test_a_scene_of_one_colour_alone_is_refused_with_a_target_size(merged, tmp_path):
+    hollow = write_without_gaussians_in_the_scene(merged, tmp_path / "hollow.hyrf", background=False)
+    with pytest.raises(HyrfError, match="no Gaussian in it and no background"):
+        compress_model(hollow, tmp_path / "small.hyrf", CompressConfig(target_bytes=9_000), context=QUIET_CONTEXT)
+    assert compress_model(hollow, tmp_path / "small.hyrf", context=QUIET_CONTEXT).bytes_after > 0
 
 
 def test_actions_after_the_first_part_is_left_out_use_the_cameras_of_the_next(merged, tmp_path):

@@ -79,6 +79,12 @@ def test_the_step_of_a_distributed_run_counts_the_steps_of_one_process(tmp_path)
     assert (status.step, status.steps) == (7, 34)
 
 
+@pytest.mark.parametrize("seconds", ["1" + 400 * "0", "NaN", "Infinity", "true", "[]"])
+def test_a_time_that_is_no_finite_number_is_unknown(seconds, tmp_path):
+    (tmp_path / "metrics.json").write_text(f'{{"seconds": {seconds}}}')
+    assert read_run_status(tmp_path).seconds is None
+
+
 def test_a_run_with_a_damaged_checkpoint_is_reported_as_unfinished(tmp_path):
     (tmp_path / "checkpoint.pt").write_bytes(b"PK damaged")
     with pytest.raises(HyrfFormatError, match="the run has not finished; finish it"):

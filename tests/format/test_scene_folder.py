@@ -9,6 +9,7 @@ import pickle
 import shutil
 import zipfile
 import zlib
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -187,3 +188,9 @@ def test_a_caller_that_changes_provenances_changes_no_later_ones():
     scene = SceneFolder(GOLDEN_SCENE_FOLDER)
     scene.read_provenances()[0]["added"] = 1
     assert "added" not in scene.read_provenances()[0]
+
+
+def test_no_fraction_of_a_scene_folder_is_read(tmp_path):
+    for call in (load_model, partial(repack, target=tmp_path / "x.hyrf")):
+        with pytest.raises(HyrfFormatError, match="has levels in place of layers.*leave out `fraction`"):
+            call(GOLDEN_SCENE_FOLDER, fraction=0.5)

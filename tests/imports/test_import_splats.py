@@ -19,7 +19,7 @@ from hyrfpack.imports.reference import ReferenceViews
 from hyrfpack.scene import Camera
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.formats import ply
-from hyrfpack.splats.splats import Splats
+from hyrfpack.splats.splats import MAX_ABS_HARMONIC, Splats
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
 pytestmark = pytest.mark.usefixtures("quick_calibration", "quick_import")
@@ -137,7 +137,7 @@ def test_a_huge_colour_is_clamped_with_a_warning(
 ) -> None:
     splats = change_harmonic(ball_splats(60), value)
     report = import_loaded_splats(splats, tmp_path / "x.hyrf", TINY_IMPORT_CONFIG, name="ball.ply")
-    bounded = change_harmonic(splats, np.clip(value, -prepare.MAX_ABS_HARMONIC, prepare.MAX_ABS_HARMONIC))
+    bounded = change_harmonic(splats, np.clip(value, -MAX_ABS_HARMONIC, MAX_ABS_HARMONIC))
     alike = import_loaded_splats(bounded, tmp_path / "y.hyrf", TINY_IMPORT_CONFIG, name="ball.ply")
     assert (tmp_path / "x.hyrf").read_bytes() == (tmp_path / "y.hyrf").read_bytes()
     assert report.psnr == alike.psnr > 30
@@ -151,7 +151,7 @@ def test_the_bound_of_harmonics_hardly_changes_a_picture() -> None:
     cameras = sample_viewpoints(weighted, Drawable.from_splats(splats, weighted.frame), 4, 64, 0)
     before, after = (
         ReferenceViews.from_splats(Drawable.from_splats(change_harmonic(splats, value), weighted.frame), cameras)
-        for value in (1e30, prepare.MAX_ABS_HARMONIC)
+        for value in (1e30, MAX_ABS_HARMONIC)
     )
     for one, other in zip(before.pictures, after.pictures, strict=True):
         assert (one - other).square().mean() < 1e-5  # 50 dB
@@ -255,7 +255,7 @@ def record_calls(monkeypatch: pytest.MonkeyPatch, place, name: str) -> list:
 
 
 def test_repeated_packing_attempts_measure_and_draw_only_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pack, "_mse", lambda psnr: 2.0**-psnr)  # makes packing seem to add a large error
+    monkeypatch.setattr(pack, "mse_from_psnr", lambda psnr: 2.0**-psnr)  # makes packing seem to add a large error
     measured = record_calls(monkeypatch, calibrate, "measure_sensitivity")
     tried = record_calls(monkeypatch, pack.Packer, "encode")
 

@@ -5,6 +5,7 @@ import pytest
 import torch
 from scenes import camera_at, small_model
 
+from hyrfpack.errors import HyrfDataError
 from hyrfpack.export.bake import bake
 from hyrfpack.model import Frame
 from hyrfpack.render import RenderSettings, render_view
@@ -26,6 +27,12 @@ def test_the_center_of_a_splat_shows_its_color_times_its_opacity():
     drawn = draw(Drawable.from_splats(splats, UNIT_FRAME), camera)
     assert drawn.rgb[16, 16].tolist() == pytest.approx([0.3, 0.25, 0.1], abs=1e-6)
     assert float(drawn.transmittance[16, 16]) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_a_splat_that_is_too_far_for_float32_is_refused():
+    splats = one_splat([[0, 0, 0]], position=(0, 1e29, 0))
+    with pytest.raises(HyrfDataError, match=r"the Gaussian at \(0, 1e\+29, 0\) is too far from the others.*remove it"):
+        Drawable.from_splats(splats, Frame((0.0, 0.0, 0.0), 1e-20, (1.0, 1.0, 1.0)))
 
 
 def test_negative_colors_are_clipped_to_zero():

@@ -95,6 +95,15 @@ def test_missing_files_unknown_suffixes_and_folders_are_refused(tmp_path):
         assert str(tmp_path) in str(refusal.value) and "\n" not in str(refusal.value)
 
 
+def test_a_missing_picture_of_an_unbundled_sog_is_named(tmp_path):
+    for name, data in sog.encode_files(random_splats()).items():
+        (tmp_path / name).write_bytes(data)
+    (tmp_path / "means_u.webp").unlink()
+    for source in (tmp_path, tmp_path / "meta.json"):
+        with pytest.raises(HyrfDataError, match=r"means_u\.webp is missing; put it beside"):
+            read_splats(source)
+
+
 def test_the_size_of_an_unbundled_sog_counts_its_own_files_only(tmp_path):
     files = sog.encode_files(random_splats())
     for name, data in {**files, "notes.txt": b"other", "unrelated.webp": b"picture"}.items():

@@ -54,7 +54,7 @@ def find_nearest_entries(rows: np.ndarray, entries: np.ndarray) -> tuple[np.ndar
     """
     points, table = torch.from_numpy(rows), torch.from_numpy(entries).T.contiguous()
     half_squares = table.square().sum(0) / 2
-    labels, distances = np.empty(len(rows), np.int64), np.empty(len(rows), np.float32)
+    labels, distances = np.zeros(len(rows), np.int64), np.empty(len(rows), np.float32)
 
     def search(block: int) -> None:
         # |p - c|^2 is smallest where p . c - |c|^2 / 2 is largest.

@@ -34,7 +34,7 @@ from hyrfpack.splats.formats.palette import build_palette, find_nearest_entries
 from hyrfpack.splats.formats.smallest_three import drop_largest, restore_largest
 from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.names import SOG_META_NAME as META_NAME
-from hyrfpack.splats.splats import Splats
+from hyrfpack.splats.splats import Splats, clamp_harmonics
 
 _PICTURES_BY_GROUP = {
     "means": ("means_l.webp", "means_u.webp"),
@@ -69,7 +69,8 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
 
     Positions are mapped by sign(x) log(1 + |x|) and rounded to 1 / 65535 of the scene's extent. Opacities are rounded
     to 1 / 255, and rotations by less than a degree. Scales and colours become one of 256 values, and harmonics of
-    bands 1 and up the nearest row of a palette. Scales below 1e-12 become 1e-12. The order of the Gaussians changes. A
+    bands 1 and up the nearest row of a palette. Scales below 1e-12 become 1e-12, and harmonics beyond +-100,000 that
+    limit, with a warning. The order of the Gaussians changes. A
     file without Gaussians has degree 0.
 
     Raises:
@@ -92,6 +93,7 @@ def encode_files(splats: Splats, group_sizes: Sequence[int] = ()) -> dict[str, b
         group_sizes: sizes of groups of consecutive splats. Groups keep their order, and the Morton curve orders the
             splats in each group. Without any, all splats are one group.
     """
+    splats = clamp_harmonics(splats, "SOG")  # Distances of larger ones would overflow float32.
     count = len(splats)
     if count > _MAX_GAUSSIANS:
         raise HyrfDataError(

@@ -265,3 +265,14 @@ def test_mutated_files_are_decoded_or_refused(data: st.DataObject) -> None:
 
 SAMPLE_FILES = sog.encode_files(random_splats(40))
 SAMPLE_BUNDLE = sog.encode(random_splats(40))
+
+
+def test_harmonics_of_a_failed_training_do_not_change_those_of_others(caplog) -> None:
+    splats = random_splats(300)
+    splats.harmonics[7, 5, 1] = 1e20
+    decoded = sog.decode(sog.encode(splats), "x.sog")
+    usual = sog.decode(sog.encode(random_splats(300)), "x.sog")
+    assert np.isfinite(decoded.harmonics).all() and np.abs(decoded.harmonics).max() == pytest.approx(1e5, rel=1e-3)
+    normal = np.abs(decoded.harmonics).max(axis=(1, 2)) < 10
+    assert normal.sum() == len(usual) - 1
+    assert "harmonics of 1 of 300 Gaussians are beyond 100,000" in caplog.text
