@@ -6,20 +6,20 @@ import json
 import os
 import tempfile
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 
-from hyrfpack.atomic import pending_file
 from hyrfpack.cameras.view_sampling import fit_camera
 from hyrfpack.colmap_library import load_pycolmap
 from hyrfpack.data.archive import display_path
 from hyrfpack.data.pictures import PhotoFile
+from hyrfpack.outputs.indexed_folder import IndexedFolder
 from hyrfpack.scene import Camera, View, evenly_spaced
 from hyrfpack.splats.splats import Splats
 
 COLMAP_FILES = tuple(f"sparse/0/{table}.bin" for table in ("cameras", "frames", "images", "points3D", "rigs"))
+_CAMERAS_TABLE = "cameras.bin"  # without which no program reads the others
 MAX_COLMAP_POINTS = 100_000  # the size of a large reconstruction
 _MIN_POINT_OPACITY = 0.1  # because the centres of fainter Gaussians need not lie on a surface
 
@@ -92,16 +92,12 @@ def write_colmap(
         for position, color in zip(chosen.positions, colors, strict=True):
             model.add_point3D(position, pycolmap.Track(), color)
 
-    target, total_bytes = Path(folder, "sparse", "0"), 0
-    with tempfile.TemporaryDirectory() as temporary, ExitStack() as tables:
+    tables = IndexedFolder(Path(folder, "sparse", "0"), _CAMERAS_TABLE, overwrite)
+    with tempfile.TemporaryDirectory() as temporary, tables:
         model.write_binary(temporary)
-        for table in sorted(Path(temporary).iterdir()):
-            data = table.read_bytes()
-            total_bytes += len(data)
-            # The files get their final names when the block ends.
-            pending = pending_file(target / table.name, len(data), overwrite=overwrite, rename=False)
-            tables.enter_context(pending).temporary.write_bytes(data)
-    return total_bytes
+        for table in sorted(Path(temporary).iterdir(), key=lambda table: (table.name == _CAMERAS_TABLE, table.name)):
+            tables.write(table.name, table.read_bytes())
+    return tables.bytes
 
 
 def encode_transforms(cameras: Sequence[tuple[str, Camera]]) -> bytes:

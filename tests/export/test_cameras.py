@@ -100,7 +100,7 @@ def test_a_failed_write_keeps_the_old_colmap_model(tmp_path, monkeypatch):
     write_bytes = Path.write_bytes
 
     def fail_when_large(self: Path, data: bytes) -> int:
-        if atomic.TEMPORARY_PREFIX in self.name and len(data) > 500:
+        if atomic.TEMPORARY_PREFIX in str(self) and len(data) > 500:
             raise OSError(28, "No space left on device")
         return write_bytes(self, data)
 
