@@ -35,7 +35,7 @@ def exclusive_folder(
 
     Args:
         folder: the folder to write into.
-        remedy: what the user can name instead, for the message: "another folder with --work".
+        remedy: what the user can name instead, for the message: "another folder with `work`".
         ranks: processes that work together, all of which call this. The main process holds the lock; if it cannot
             get the lock, all of them raise the error.
 

@@ -26,6 +26,7 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Scene
 
 _FILE_SIGNATURE = b"# Bundle file v0.3"
+_MAX_COUNT_DIGITS = 15  # Python does not format numbers of thousands of digits.
 _LIST_PATTERNS = ("list.txt", "*.list.txt", "*list*.txt", "*.lst")
 
 
@@ -139,7 +140,10 @@ def _read_bundle(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Read the (N, 5, 3) rows of the cameras, (P, 3) points and (P, 3) colours in [0, 1]."""
     lines = [line for line in read_text(file).splitlines() if line.strip() and not line.startswith("#")]
     try:
-        cameras, points = map(int, lines[0].split()[:2])
+        counts = lines[0].split()[:2]
+        if any(len(count) > _MAX_COUNT_DIGITS for count in counts):
+            raise ValueError("a number has too many digits")
+        cameras, points = map(int, counts)
     except (IndexError, ValueError) as error:
         raise HyrfDataError(
             f"{file}: does not say how many cameras and points it holds",

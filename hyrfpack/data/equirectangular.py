@@ -106,14 +106,15 @@ class FaceFile:
             )
         mask = None
         if self.mask is not None:
-            panorama_mask = read_mask(self.mask, *rgb.shape[:2])
-            row, column = _source_coordinates(self.face, self.size, *panorama_mask.shape)
-            rows = np.clip(np.rint(row), 0, len(panorama_mask) - 1).astype(int)
-            mask = panorama_mask[rows, np.rint(column).astype(int) % rgb.shape[1]]
+            mask = self._cut_mask(read_mask(self.mask, *rgb.shape[:2]))
         if alpha is not None and alpha.min() < 255:
-            is_opaque = cut_face(alpha[..., None], self.face, self.size)[..., 0] == 255
+            is_opaque = self._cut_mask(alpha == 255)
             mask = is_opaque if mask is None else mask & is_opaque
         return Picture(cut_face(rgb, self.face, self.size), None, mask)
+
+    def _cut_mask(self, usable: np.ndarray) -> np.ndarray:
+        """Return the mask of the face: pixels whose colours come from usable pixels (H, W) of the panorama alone."""
+        return cut_face(np.uint8(255) * usable[..., None], self.face, self.size)[..., 0] == 255
 
 
 def face_size(width: int) -> int:

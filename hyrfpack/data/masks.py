@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -49,6 +50,12 @@ def find_mask_folder(root: Path, picture_folder: str) -> Path:
     """Return the folder of masks for a folder of photos: `masks/`, or "masks_2" for "images_2" if that exists."""
     suffix = picture_folder.removeprefix("images")
     return root / f"masks{suffix}" if suffix and (root / f"masks{suffix}").is_dir() else root / "masks"
+
+
+def locate_masks(photos: Path) -> Path | None:
+    """Return the folder of masks of photos without poses: masks/ or mask/ in their folder, or masks/ beside it."""
+    beside = Path(os.path.abspath(photos)).parent
+    return next((folder for folder in (photos / "masks", photos / "mask", beside / "masks") if folder.is_dir()), None)
 
 
 def find_masks(

@@ -180,10 +180,11 @@ def _photo_name(picture: Path, folder: Path, listed: PurePosixPath, strip: PureP
 def _check_scale_is_known(content: dict[str, Any], frame: dict[str, Any], file: Path) -> None:
     """Raise HyrfDataError if focal lengths cannot be scaled to photos from another folder, which may be smaller.
 
-    Scaling needs 'w', the calibrated width, or an angle of view.
+    Scaling needs 'w', the calibrated width, or an angle of view, which counts only where no focal length is stated.
     """
-    entries = {**content, **frame}
-    if entries.get("w") is None and entries.get("camera_angle_x") is None:
+    entries = {name: value for name, value in {**content, **focal_entries(frame, content), **frame}.items() if value}
+    is_angle = "camera_angle_x" in entries and not entries.keys() & {"fl_x", "fl_y"}
+    if "w" not in entries and not is_angle:
         raise HyrfDataError(
             f"{file}: there is no 'w' and 'h', so that focal lengths cannot be scaled to the photos of another folder",
             fix="add the width and height of the calibration",

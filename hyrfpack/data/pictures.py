@@ -90,7 +90,7 @@ class PhotoFile:
             raise self._size_changed_error()
         mask = None
         if self.mask is not None:
-            mask = read_mask(self.mask, height, width, require_all=shrunk, orientation=self.mask_orientation)
+            mask = read_mask(self.mask, height, width, orientation=self.mask_orientation)
         picture = Picture(rgb, alpha, mask)
         return undistort(picture, self.lens) if self.lens.is_distorted else picture
 
@@ -233,8 +233,10 @@ def is_tagged_panorama(path: Path) -> bool:
         HyrfDataError: the file is missing, empty, or no picture.
     """
     with open_picture(path) as image:
-        xmp = image.info.get("xmp") or b""
-    xmp = xmp.encode() if isinstance(xmp, str) else bytes(xmp)
+        xmp = image.info.get("xmp")
+    xmp = xmp.encode(errors="replace") if isinstance(xmp, str) else xmp
+    if not isinstance(xmp, bytes):  # a TIFF may state numbers
+        return False
     return b"GPano:ProjectionType" in xmp and b"equirectangular" in xmp
 
 
@@ -275,6 +277,8 @@ def read_pixels(
             applied = _orientation_applied_by_pillow(image)
             if image.mode in _SIXTEEN_BIT_MODES:
                 values = np.asarray(image).astype(np.float64)
+                if values.max() > 65535 and not as_mask:
+                    raise ValueError("its numbers have 32 bits and no known range, save it with 8 or 16 bits")
                 levels = np.where(values != 0, 255, 0) if as_mask else np.clip(values, 0, 65535) / 257 + 0.5
                 picture = Image.fromarray(levels.astype(np.uint8))
             else:
@@ -298,7 +302,7 @@ def read_pixels(
     return pixels, None
 
 
-def read_mask(path: Path, height: int, width: int, *, require_all: bool = False, orientation: int = 1) -> np.ndarray:
+def read_mask(path: Path, height: int, width: int, *, orientation: int = 1) -> np.ndarray:
     """Decode a mask, in which black marks a pixel to ignore, and resize it.
 
     Black is level 0, and in JPEG and lossy WebP files every level below 64. If all pixels of the mask have one colour
@@ -307,12 +311,11 @@ def read_mask(path: Path, height: int, width: int, *, require_all: bool = False,
     Args:
         path: the file.
         height, width: size of the result.
-        require_all: a pixel of the result is usable only if all mask pixels that it covers are usable, as is right for
-            shrunk photos. If False, or if the mask is smaller than the result, the nearest mask pixel decides.
         orientation: EXIF orientation by which the mask is turned.
 
     Returns:
-        (height, width) bool, True for usable pixels.
+        (height, width) bool, True for usable pixels. A pixel is usable if all mask pixels that it covers are. Where the
+        mask is smaller than the result, the mask pixel nearest to its centre decides.
     """
     rgb, alpha = read_pixels(path, orientation=orientation, as_mask=True)
     min_usable_level = _MIN_USABLE_LEVEL_IN_LOSSY_MASKS if _is_lossy(path) else 1
@@ -323,12 +326,12 @@ def read_mask(path: Path, height: int, width: int, *, require_all: bool = False,
         usable = np.any(rgb >= min_usable_level, axis=2)
     if usable.shape == (height, width):
         return usable
-    if require_all and usable.shape[0] >= height and usable.shape[1] >= width:
+    if usable.shape[0] >= height and usable.shape[1] >= width:
         usable = np.logical_and.reduceat(usable, _covering_bounds(usable.shape[0], height), axis=0)[::2]
         usable = np.logical_and.reduceat(usable, _covering_bounds(usable.shape[1], width), axis=1)[:, ::2]
         return np.ascontiguousarray(usable)
-    rows = (np.arange(height) * usable.shape[0]) // height
-    columns = (np.arange(width) * usable.shape[1]) // width
+    rows = (2 * np.arange(height) + 1) * usable.shape[0] // (2 * height)
+    columns = (2 * np.arange(width) + 1) * usable.shape[1] // (2 * width)
     return usable[rows[:, None], columns]
 
 

@@ -96,7 +96,8 @@ def find_listed_photos(
         lens = lens(file, header) if callable(lens) else lens
         photos.append(PosedPhoto(pictures.photo_name(file, name), file, header, lens, pose))
     notes = matches.notes + missing_photos_notes(path, photos, missing, where, matches.ambiguous)
-    return photos, find_mask_folder(path, folder.name), notes
+    masks = [find_mask_folder(root, folder.name) for root in (folder.parent, path)]
+    return photos, next((mask for mask in masks if mask.is_dir()), masks[-1]), notes
 
 
 def read_sidecar_points(

@@ -42,8 +42,8 @@ class Evaluation:
         psnr: PSNR in dB, from the squared error pooled over the pixels and channels of each view, averaged over views.
             Renders are at the exposure as photographed, like those of `hyrfpack.render_view`, unless `settings` ask for
             the consistent exposure.
-        psnr_consistent: PSNR of renders at the model's consistent exposure; None for splats and for models without an
-            exposure map.
+        psnr_consistent: PSNR of renders at the model's consistent exposure; None for splats, for merged models and for
+            models without an exposure map.
         psnr_corrected: PSNR of renders after an affine colour correction to the photo that they are scored against, see
             `hyrfpack.evaluate.exposure.correct_colors`.
         ssim: SSIM of the renders of `psnr`, with a Gaussian window of 11x11 pixels and sigma 1.5.

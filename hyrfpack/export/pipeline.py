@@ -35,7 +35,6 @@ from hyrfpack.export.kinds import (
     find_file_kind,
 )
 from hyrfpack.export.levels import bake_levels, open_levels
-from hyrfpack.export.meshes import write_collision_mesh, write_mesh
 from hyrfpack.export.pages import encode_baked_page, suggest_compression, write_native_page
 from hyrfpack.export.points import encode_points
 from hyrfpack.export.report import ExportReport
@@ -48,6 +47,7 @@ from hyrfpack.format.input_folder import find_input_folder
 from hyrfpack.format.scene_folder import SceneFolder, as_single_file
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
+from hyrfpack.parallel import has_numba
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.scene import Scene
 from hyrfpack.splats.formats.hints import Hints
@@ -168,13 +168,31 @@ def _export_file(
         if kind is COLMAP_FOLDER and data is not None and data.train:
             loaded = replace(loaded, cameras=[(view.name, fit_to_file(view)) for view in data.train])
         with context.open_progress("export") as progress:
-            if kind in MESH_FILES:
-                return write_mesh(loaded, target, kind, config, overwrite, progress)
-            if kind in COLLISION_FILES:
-                return write_collision_mesh(loaded, target, kind, config, overwrite, progress)
+            if kind in (*MESH_FILES, *COLLISION_FILES):
+                return _write_mesh(loaded, target, kind, config, overwrite, progress)
             if scene is not None:
                 return _export_levels(loaded, scene, Path(target), kind, config, overwrite, progress)
             return _export_gaussians(loaded, Path(target), kind, config, overwrite, progress)
+
+
+def _write_mesh(
+    loaded: Source,
+    target: str | os.PathLike[str],
+    kind: FileKind,
+    config: ExportConfig,
+    overwrite: bool,
+    progress: Progress,
+) -> ExportReport:
+    """Write a mesh or a collision mesh. Only meshes need Numba, so other exports do without importing it."""
+    if not has_numba():
+        raise HyrfError(
+            f"{target}: meshes are extracted by Numba, which is missing or does not work here",
+            fix="install it ('hyrfpack doctor' tells what is wrong), or export Gaussians",
+        )
+    from hyrfpack.export.meshes import write_collision_mesh, write_mesh
+
+    write = write_mesh if kind in MESH_FILES else write_collision_mesh
+    return write(loaded, target, kind, config, overwrite, progress)
 
 
 def _export_gaussians(

@@ -20,8 +20,8 @@ from hyrfpack.ops.rasterize.light import measure_light
 from hyrfpack.ops.viewport import Viewport
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress
 from hyrfpack.render import RenderSettings, render_view
-from hyrfpack.render.parts import camera_frame, gather_geometry
 from hyrfpack.render.renderer import make_raster_settings
+from hyrfpack.render.surface import drawn_gaussians
 from hyrfpack.scene import Camera
 
 ERROR_RADII = (16.0, 32.0, 64.0, 128.0, 256.0, 512.0, 1024.0)
@@ -133,11 +133,7 @@ class _PooledChunks:
     def open_view(self, camera: Camera) -> _FinestView:
         """Return the finest levels of all chunks as a camera sees them."""
         index, model = torch.from_numpy(np.flatnonzero(self.level_of == 0)), self.model
-        if isinstance(model, MergedModel):
-            gaussians, frame = gather_geometry(model, camera, index, self.decoded), camera_frame(model, camera)
-        else:
-            frame = model.config.frame
-            gaussians = self.decoded[index].geometry.with_means(model.gaussians.positions[index])
+        gaussians, frame = drawn_gaussians(model, camera, self.decoded, index)
         viewport = frame.local_viewport(camera, gaussians.means.dtype)
         settings = make_raster_settings(model, RenderSettings())
         return _FinestView(gaussians, self.chunk_of[self.level_of == 0], viewport, settings)

@@ -11,6 +11,7 @@ from hyrfpack.data import load_scene
 from hyrfpack.data.archive import is_archive, unpack
 from hyrfpack.data.equirectangular import group_faces
 from hyrfpack.data.folder import explain_missing_path, list_photos, list_pictures
+from hyrfpack.data.masks import locate_masks
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
 from hyrfpack.make.held_out import choose_inner_view
 from hyrfpack.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs, StrPath
@@ -112,10 +113,8 @@ class Source:
         """Return the files from which poses are estimated: photos and their masks, or a video."""
         if self.path.is_file():
             return [self.path]
-        mask_folders = [self.path / "masks", self.path / "mask"]
-        mask_folders += [self.path.parent / "masks"] if self.path.name == "images" else []
-        masks = [mask for folder in mask_folders if folder.is_dir() for mask in list_pictures(folder)]
-        return [*list_photos(self.path), *masks]
+        masks = locate_masks(self.path)
+        return [*list_photos(self.path), *([] if masks is None else list_pictures(masks))]
 
     def output_rules(self, overwrite: bool) -> list[Outputs]:
         """Return the rules that protect the source from being overwritten; all of them apply."""

@@ -17,7 +17,7 @@ from hyrfpack.counts import format_count
 from hyrfpack.data.archive import archive_paths_in_errors, is_archive, unpack
 from hyrfpack.data.equirectangular import CUBE_FACES, is_panorama
 from hyrfpack.data.folder import list_photos, list_pictures, list_raw_photos
-from hyrfpack.data.masks import MaskMatches
+from hyrfpack.data.masks import MaskMatches, locate_masks
 from hyrfpack.data.unusable import raise_if_single_photo, raw_photos_notes, unreadable_sentences
 from hyrfpack.errors import HyrfDataError, suggest_command
 from hyrfpack.lock import exclusive_folder
@@ -290,10 +290,7 @@ class _PoseEstimation:
             return Path(self.masks)
         if self.photos.is_file():
             return None
-        candidates = [self.out / "masks"] if in_place else [self.photos / "masks", self.photos / "mask"]
-        if self.photos.name == "images":
-            candidates.append(self.photos.parent / "masks")
-        return next((folder for folder in candidates if folder.is_dir()), None)
+        return locate_masks(self.out / "images" if in_place else self.photos)
 
     def _claim_work_folder(self) -> None:
         """Create the folder of products in progress, or take over the folder of an interrupted call."""

@@ -105,7 +105,7 @@ def _write_working_copy(job: Job, folder: Path, size: tuple[int, int], name: str
         mask.parent.mkdir(parents=True, exist_ok=True)
         usable = np.ones(size[::-1], bool)
         if name in job.masks:
-            usable = read_mask(Path(job.masks[name]), size[1], size[0], require_all=True)
+            usable = read_mask(Path(job.masks[name]), size[1], size[0])
         Image.fromarray(usable.astype(np.uint8) * 255).save(mask, compress_level=1)
     return float(measure_sharpness(grey / 255)), ""
 

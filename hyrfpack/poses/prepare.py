@@ -344,5 +344,7 @@ def _write_photo(photo: Photo, target: Path) -> None:
             if upright.mode in ("CMYK", "LAB", "YCbCr"):  # the colour profile describes the old mode
                 profile = None
             upright = upright.convert("RGB")
-        metadata = {"icc_profile": profile} if profile else {}
+        metadata = (
+            {"icc_profile": profile} if profile and isinstance(profile, bytes) else {}
+        )  # a TIFF may state numbers
         upright.save(target, "JPEG" if jpeg else "PNG", **(_JPEG_SAVE_OPTIONS if jpeg else {}), **metadata)

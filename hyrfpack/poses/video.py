@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -93,7 +94,9 @@ def open_video(path: Path) -> Iterator[Video]:
     if path.stat().st_size == 0:
         raise HyrfDataError(f"{path}: the video is empty (0 bytes)", fix="copy it again")
     try:
-        container = av.open(str(path))
+        container = av.open(
+            os.path.abspath(path)
+        )  # FFmpeg takes what precedes a colon in a relative path for a protocol
     except Exception as error:  # PyAV passes on many types of errors, of FFmpeg's demuxers and of the system
         raise HyrfDataError(
             f"{path}: this cannot be read as a video ({_error_text(error)})",

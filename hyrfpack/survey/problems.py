@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Container, Hashable, Iterable, Iterator
+import os
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
@@ -12,10 +13,10 @@ import numpy as np
 
 from hyrfpack.counts import format_count
 from hyrfpack.data.folder import PhotoFacts
+from hyrfpack.data.masks import find_masks, locate_masks
 from hyrfpack.data.quality import MIN_SHARPNESS
 from hyrfpack.data.unusable import format_file_names
 from hyrfpack.errors import suggest_command
-from hyrfpack.outputs import PICTURE_SUFFIXES
 from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.survey.measure import PIXELS_PROGRESS, PhotoMeasurement, relative_name
@@ -202,19 +203,15 @@ def find_zoom_problems(facts: list[PhotoFacts]) -> list[str]:
     ]
 
 
-def find_mask_problems(folder: Path, photos: list[Path]) -> list[str]:
-    """Describe masks whose names match no photo; for photos with poses, `load_scene` reports them."""
-    masks = next((folder / name for name in ("masks", "mask") if (folder / name).is_dir()), None)
-    mask_files = [] if masks is None else [file for file in masks.rglob("*") if file.suffix.lower() in PICTURE_SUFFIXES]
-    names = {photo.stem for photo in photos} | {photo.name for photo in photos}
-    unmatched = sorted(file.name for file in mask_files if file.stem not in names)
-    if not unmatched:
+def find_mask_problems(folder: Path, facts: Sequence[PhotoFacts]) -> list[str]:
+    """Describe masks that fit no photo; for photos with poses, `load_scene` reports them."""
+    masks = locate_masks(folder)
+    if masks is None:
         return []
-    of_masks = f"of {len(mask_files)} masks"
-    return [
-        f"{format_count(len(unmatched), f'{of_masks} matches', f'{of_masks} match')} no photo "
-        f"({format_file_names(unmatched)}); give each the name of its photo"
-    ]
+    photos = [(Path(os.path.relpath(fact.path, folder)).as_posix(), fact.size) for fact in facts]
+    matches = find_masks(masks, photos, set())
+    is_shared = len(set(matches.by_photo.values())) == 1 < len(matches.by_photo)  # noted, but no problem
+    return [] if is_shared else matches.notes
 
 
 def describe_headers(facts: list[PhotoFacts]) -> list[str]:

@@ -136,6 +136,7 @@ def rewrite(root, change) -> None:
         ),
         (lambda root: rewrite(root, lambda text: text.replace("4 4\n", "many\n")), "how many cameras"),
         (lambda root: rewrite(root, lambda text: text.replace("4 4\n", "-1 4\n")), "is truncated"),
+        (lambda root: rewrite(root, lambda text: text.replace("4 4\n", 4_300 * "9" + " 4\n")), "how many cameras"),
         (lambda root: rewrite(root, lambda text: text.replace("6.8458150610e+02", "nan")), "not finite"),
         (lambda root: rewrite(root, lambda text: text.replace("6.8458150610e+02", "-1")), "unusable intrinsics"),
         (lambda root: rewrite(root, lambda text: text.replace("9.9187742625e-01", "9")), "not rigid"),

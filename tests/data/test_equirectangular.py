@@ -209,8 +209,26 @@ def test_faces_are_reduced_and_masked_with_their_panorama(tmp_path):
 
     assert views["a_down.png"].rgb.shape == (40, 40, 3)
     assert not views["a_down.png"].mask[10:30, 10:30].any() and views["a_up.png"].mask.all()
-    assert 0 < (~views["a_front.png"].mask).mean() < 0.2  # in its middle, the face reaches 45 degrees below the horizon
+    # In its middle, the face reaches 45 degrees below the horizon. Pixels that mix with the photographer count, too.
+    assert 0 < (~views["a_front.png"].mask).mean() < 0.2 + 1 / 40
     assert views["b_down.png"].mask is None
+
+
+def test_no_colour_of_a_shrunk_face_comes_from_masked_pixels(tmp_path):
+    write_posed_panoramas(tmp_path, 256)
+    mask = np.full((256, 512), 255, np.uint8)
+    mask[:, 255:258] = 0  # a pole
+    photo = np.asarray(Image.open(tmp_path / "images" / "a.png")).copy()
+    photo[:, 255:258] = 255, 0, 255
+    Image.fromarray(photo).save(tmp_path / "images" / "a.png")
+    (tmp_path / "masks").mkdir()
+    Image.fromarray(mask).save(tmp_path / "masks" / "a.png")
+
+    front = next(view for view in load_scene(tmp_path, test_every=0, max_size=40).views if view.name == "a_front.png")
+
+    picture, clean = front.load(), render_face(CUBE_FACES[0], 40)
+    # The side lobes of the filter that shrinks photos reach further than the pixel, with less than a tenth of the weight.
+    assert np.abs(picture.rgb - clean)[picture.mask].max() < 0.1 * 255 and 0.8 < picture.mask.mean() < 1
 
 
 def test_a_mask_with_the_name_of_a_panorama_is_assigned_to_all_its_faces(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from hyrfpack.data import load_scene
-from hyrfpack.data.masks import MaskedPhoto, assign_masks, choose_mask_orientations
+from hyrfpack.data.masks import MaskedPhoto, assign_masks, choose_mask_orientations, locate_masks
 from hyrfpack.data.pictures import read_mask
 from hyrfpack.errors import HyrfDataError
 
@@ -156,3 +156,21 @@ def test_the_alpha_of_a_mask_of_one_colour_is_used(tmp_path, colours, alphas, us
     Image.fromarray(pixels).save(tmp_path / "m.png")
 
     np.testing.assert_array_equal(read_mask(tmp_path / "m.png", 1, 3), np.array([usable], bool))
+
+
+def test_a_smaller_mask_counts_at_the_centres_of_pixels(tmp_path):
+    Image.fromarray(np.array([[0] * 4 + [255] * 4], np.uint8)).save(tmp_path / "m.png")
+    # The centres of the columns lie 1/6, 1/2 and 5/6 of the way; the middle one lies on the first white pixel.
+    assert read_mask(tmp_path / "m.png", 2, 8)[1].tolist() == [False] * 4 + [True] * 4
+    Image.fromarray(np.array([[0, 255]], np.uint8)).save(tmp_path / "m.png")
+    assert read_mask(tmp_path / "m.png", 1, 3)[0].tolist() == [False, True, True]
+
+
+def test_masks_of_photos_without_poses_are_found_in_their_folder_or_beside_it(tmp_path, monkeypatch):
+    photos = tmp_path / "input"
+    photos.mkdir()
+    monkeypatch.chdir(photos)
+    assert locate_masks(photos) is None
+    for folder in (tmp_path / "masks", photos / "mask", photos / "masks"):
+        folder.mkdir()
+        assert locate_masks(photos) == folder and locate_masks(Path()).samefile(folder)

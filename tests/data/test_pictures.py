@@ -8,11 +8,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import Image, TiffImagePlugin, TiffTags
 from property_tests import examples
 
 from hyrfpack.data.archive import unpack
-from hyrfpack.data.pictures import PhotoFile, has_same_aspect, read_header, read_mask, read_orientation, read_pixels
+from hyrfpack.data.pictures import (
+    PhotoFile,
+    has_same_aspect,
+    is_tagged_panorama,
+    read_header,
+    read_mask,
+    read_orientation,
+    read_pixels,
+)
 from hyrfpack.data.undistort import Lens
 from hyrfpack.errors import HyrfDataError
 
@@ -242,3 +250,20 @@ def test_a_picture_with_too_many_pixels_is_refused(tmp_path, monkeypatch):
 def test_missing_picture_names_the_file(tmp_path):
     with pytest.raises(HyrfDataError, match=r"gone\.png.*missing"):
         read_pixels(tmp_path / "gone.png")
+
+
+@pytest.mark.parametrize("value", [1.5, 7])
+def test_an_xmp_tag_of_numbers_declares_no_panorama(tmp_path, value):
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags.tagtype[700] = TiffTags.DOUBLE if isinstance(value, float) else TiffTags.LONG
+    tags[700] = value
+    Image.fromarray(np.zeros((8, 16, 3), np.uint8)).save(tmp_path / "a.tif", tiffinfo=tags)
+    assert not is_tagged_panorama(tmp_path / "a.tif")
+
+
+def test_integers_of_32_bits_are_refused_unless_they_fit_16_bits(tmp_path):
+    for name, largest in (("fits.tif", 65_535), ("large.tif", 65_000_000)):
+        Image.fromarray(np.linspace(0, largest, 64, dtype=np.int32).reshape(8, 8)).save(tmp_path / name)
+    assert read_pixels(tmp_path / "fits.tif")[0][:, :, 0].max() == 255
+    with pytest.raises(HyrfDataError, match="32 bits and no known range, save it with 8 or 16 bits"):
+        read_pixels(tmp_path / "large.tif")

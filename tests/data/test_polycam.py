@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from hyrfpack.data import load_scene
 from hyrfpack.errors import HyrfDataError
@@ -78,3 +79,11 @@ def test_a_camera_that_is_no_json_object_is_a_clear_error(folder, content):
 
     with pytest.raises(HyrfDataError, match="JSON"):
         load_scene(folder)
+
+
+@pytest.mark.parametrize("place", ["keyframes/masks", "masks"])
+def test_masks_lie_beside_the_photos_or_in_the_scene(folder, place):
+    (folder / place).mkdir()
+    for stem in PHOTO_STEMS:
+        Image.new("L", (32, 24), 0).save(folder / place / f"{stem}.png")
+    assert not any(view.load().mask.any() for view in load_scene(folder, test_every=0).views)

@@ -176,6 +176,11 @@ def test_zooms_orientations_and_sizes_are_distinguished(photos):
     assert any("1 of 25 photos is larger" in note for note in survey.notes)
 
 
+def test_one_mask_for_all_photos_is_no_problem(photos):
+    save_photo(photos / "masks" / "lens.png", random_rectangles(1))
+    assert [problem for problem in describe_photos(photos).problems if " mask" in problem] == []
+
+
 def test_masks_without_matching_photos_are_detected(photos):
     for number in range(24):
         save_photo(photos / "masks" / f"{number:03d}.jpg.png", random_rectangles(number))
