@@ -200,6 +200,11 @@ def note_rename(requested: Path, written_path: Path | str) -> Path:
     return Path(written_path)
 
 
+def suggest_model_name(splats: Path) -> str:
+    """Return a name for the model that is imported from splats: "room.hyrf" for room.ply or for a folder room/."""
+    return f"{Path(os.path.abspath(splats)).stem or 'scene'}.hyrf"
+
+
 def resolve_model_file(path: Path) -> Path:
     """Return the `.hyrf` file that an argument names by its path or by the folder of its run.
 
@@ -210,7 +215,7 @@ def resolve_model_file(path: Path) -> Path:
     from hyrfpack.splats.names import is_splats
 
     if is_splats(path):
-        model = Path(path.stem).with_suffix(".hyrf")
+        model = suggest_model_name(path)
         raise HyrfError(
             f"{path}: these are splats, not a model",
             fix=f"import it first: {suggest_command('import', path, '-o', model)}",

@@ -12,6 +12,7 @@ from hyrfpack.cli.common import format_consistent_psnr, format_table, note, prin
 from hyrfpack.cli.drawing import drawing_options, largest_picture_size, select_views, split_option
 from hyrfpack.cli.types import INPUT_PATH, OUTPUT_FOLDER
 from hyrfpack.counts import format_count
+from hyrfpack.errors import printable
 from hyrfpack.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -102,7 +103,7 @@ def evaluate(
     if as_json:
         print_json({"bytes": size, "max_size": scene.max_size, "picture_size": [width, height], **scores.to_dict()})
         return
-    rows = [*(_score_row(view.name, view) for view in scores.views), _score_row("mean", scores)]
+    rows = [*(_score_row(printable(view.name), view) for view in scores.views), _score_row("mean", scores)]
     click.echo(format_table(["view", "PSNR (dB)", "corrected", "SSIM", "LPIPS"], rows))
     limit = f"--max-size {scene.max_size}" if scene.max_size else "as they are stored"
     click.echo(f"{format_count(len(scores.views), 'photo')} of up to {width} x {height} pixels ({limit})")

@@ -17,6 +17,7 @@ from hyrfpack.cli.common import (
     print_json,
     read_scene,
     scene_options,
+    suggest_model_name,
 )
 from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import BOX, HARMONICS_DEGREE, INPUT_PATH, OUTPUT
@@ -194,7 +195,7 @@ def _splats_error(source: Path, output: Path, kind: FileKind) -> HyrfError:
     return HyrfError(
         f"{source}: only a folder (-o player/) can play splats",
         fix=f"to write {kind.ending or 'this'}, import them first: "
-        f"{suggest_command('import', source, '-o', source.with_suffix('.hyrf').name)}",
+        f"{suggest_command('import', source, '-o', suggest_model_name(source))}",
     )
 
 

@@ -23,7 +23,7 @@ from hyrfpack.cli.settings import reject_two_sizes, settings_options
 from hyrfpack.cli.types import INPUT_PATH, OUTPUT, OUTPUT_FOLDER
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.counts import format_count
-from hyrfpack.errors import suggest_command
+from hyrfpack.errors import printable, suggest_command
 
 if TYPE_CHECKING:
     from hyrfpack.make import MakeResult
@@ -117,7 +117,7 @@ def _print_result(result: MakeResult) -> None:
         sure = f", {poses['sure']} confirmed by both mappers" if poses["sure"] < poses["registered"] else ""
         click.echo(f"poses: {poses['registered']} of {poses['photos']} photos{sure}")
         for name, reason in list(poses["left_out"].items())[:MAX_LISTED_PHOTOS]:
-            click.echo(f"  left out: {name}, {reason}")
+            click.echo(f"  left out: {printable(name)}, {reason}")
         if (unlisted_count := len(poses["left_out"]) - MAX_LISTED_PHOTOS) > 0:
             click.echo(f"  left out: {unlisted_count} more, see {result.work / 'scene' / 'poses.json'}")
     times = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result.seconds.items())

@@ -15,6 +15,7 @@ from hyrfpack.cli.settings import settings_options
 from hyrfpack.cli.types import INPUT_PATH, OUTPUT_FOLDER
 from hyrfpack.config.poses import PosesConfig
 from hyrfpack.counts import format_count
+from hyrfpack.errors import printable
 
 if TYPE_CHECKING:
     from hyrfpack.poses import PosesReport
@@ -69,6 +70,6 @@ def _print_result(result: PosesReport) -> None:
     for reason, count in Counter(result.left_out.values()).most_common():
         names = [name for name, why in result.left_out.items() if why == reason]
         others = f" and {count - _MAX_NAMED_PHOTOS} more" if count > _MAX_NAMED_PHOTOS else ""
-        click.echo(f"left out, {reason}: {', '.join(names[:_MAX_NAMED_PHOTOS])}{others}")
+        click.echo(f"left out, {reason}: {printable(', '.join(names[:_MAX_NAMED_PHOTOS]))}{others}")
     run = f"runs/{result.scene.resolve().name}"
     click.echo(f"next: hyrfpack train {shlex.quote(str(result.scene))} -o {shlex.quote(run)}")

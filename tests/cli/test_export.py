@@ -28,7 +28,7 @@ from hyrfpack.cli import main
 from hyrfpack.data import load_scene
 from hyrfpack.format import save_model
 from hyrfpack.splats.files import read_splats
-from hyrfpack.splats.formats import ply
+from hyrfpack.splats.formats import ply, sog
 from hyrfpack.web import view as web_view
 
 GOLDEN_SCENE_FOLDER = Path(__file__).parents[1] / "golden" / "scene"
@@ -390,3 +390,13 @@ def test_view_opens_the_browser_where_it_says(model, monkeypatch):
     monkeypatch.setattr("hyrfpack.web.serve.ThreadingHTTPServer.serve_forever", lambda server: None)
     result = CliRunner().invoke(main, ["view", str(model)])
     assert result.exit_code == 0 and opened == [result.stdout.strip()]
+
+
+def test_the_current_folder_of_a_sog_is_named_in_the_command_that_imports_it(tmp_path, monkeypatch):
+    folder = tmp_path / "room"
+    folder.mkdir()
+    for name, data in sog.encode_files(ball_splats(20)).items():
+        (folder / name).write_bytes(data)
+    monkeypatch.chdir(folder)
+    assert "hyrfpack import . -o room.hyrf" in refused("export", ".", "-o", tmp_path / "x.html")
+    assert "hyrfpack import . -o room.hyrf" in refused("edit", ".", "--plan", "--min-opacity", 0.1)

@@ -227,7 +227,7 @@ def test_no_colour_of_a_shrunk_face_comes_from_masked_pixels(tmp_path):
     front = next(view for view in load_scene(tmp_path, test_every=0, max_size=40).views if view.name == "a_front.png")
 
     picture, clean = front.load(), render_face(CUBE_FACES[0], 40)
-    # The side lobes of the filter that shrinks photos reach further than the pixel, with less than a tenth of the weight.
+    # The side lobes of the filter that shrinks photos reach further than the pixel, with a tenth of the weight at most.
     assert np.abs(picture.rgb - clean)[picture.mask].max() < 0.1 * 255 and 0.8 < picture.mask.mean() < 1
 
 

@@ -4,8 +4,8 @@
 //
 // Prints, as JSON, `levels`: the number of levels that the page was sent; `most`: the largest number of further parts
 // whose fields it held at a time; `again`: the number of parts that it was sent again; `early`: the number of levels that
-// came without the fields of their part; and `dropped`: the number of levels that were not evaluated when their fields
-// were dropped.
+// came without the fields of their part; `dropped`: the number of levels that were not evaluated when their fields were
+// dropped; and `kept`: the number of Gaussians that are drawn after a part has become unusable.
 
 import { readFileSync } from "node:fs";
 import { setTimeout as wait } from "node:timers/promises";
@@ -48,5 +48,7 @@ const stream = streamScene(manifest, Number(budget), ({ content, part, chunk, st
 while (!state?.isComplete) await wait(POLL_MS);
 stream.handle({ gaussians: 1e9 });
 while (!state.isComplete || state.gaussians !== manifest.gaussians) await wait(POLL_MS);
+stream.handle({ unusable: { part: 1, reason: "its fields are gone." } });
+while (!state.isComplete || !state.problem) await wait(POLL_MS);
 stream.close();
-console.log(JSON.stringify({ levels: levels.size, ...counts }));
+console.log(JSON.stringify({ levels: levels.size, ...counts, kept: state.gaussians }));

@@ -98,6 +98,19 @@ def test_the_player_keeps_the_gaussians_that_its_command_keeps(name: str, tmp_pa
     assert found["counts"][-1] == len(edited)
 
 
+def test_a_direction_that_is_stated_after_a_box_does_not_turn_the_box(tmp_path: Path):
+    script = tmp_path / "put.mjs"
+    module = Path(__file__).parents[2] / "hyrfpack" / "web" / "viewer" / "edit" / "actions.js"
+    before = [{"option": "up", "value": [0, 0, 1]}, {"option": "crop-box", "value": [0, 0, 0, 1, 1, 1, 30]}]
+    later, last = ({"option": "up", "value": value} for value in ([0, 1, 0], [1, 0, 0]))
+    script.write_text(
+        f"import {{ putAction }} from {json.dumps(module.as_uri())};\n"
+        f"const later = putAction({json.dumps(before)}, {json.dumps(later)});\n"
+        f"console.log(JSON.stringify([later, putAction(later, {json.dumps(last)})]));\n"
+    )
+    assert run_script(script) == [[*before, later], [*before, last]]
+
+
 @pytest.mark.parametrize("factor", [-1.0, 0.0, 1e-32, 1e-31, 1.0, 1e23, 1e24, math.inf, math.nan])
 def test_the_player_scales_only_to_sizes_that_the_command_accepts(factor: float, tmp_path: Path):
     script = tmp_path / "storable.mjs"

@@ -14,7 +14,7 @@ import { Poster } from "./poster.js";
 import { savePicture, shareView } from "./share.js";
 import { setTextSource } from "./texts.js";
 
-const FADE_MS = 600; // the duration in style.css
+const FADE_MS = 600; // a little longer than the transition in style.css
 const IGNORED_TEXTS = {
   wheel: "Click the scene, then the wheel zooms.",
   finger: "Tap the scene, then fingers move it.",

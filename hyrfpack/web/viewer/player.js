@@ -192,9 +192,10 @@ export class Player extends EventTarget {
     }
   }
 
-  // Rejects the promises of `settled` if there is no picture and none will come.
+  // Rejects the promises of `settled` if there is no picture and none will come. After a load that another one has
+  // replaced, one may come.
   giveUp(error) {
-    if (this.loaded || this.next) return;
+    if (this.loaded || this.next || error instanceof SupersededError) return;
     this.failure = error;
     for (const { reject } of this.onIdle.splice(0)) reject(error);
   }
@@ -647,8 +648,9 @@ export class Player extends EventTarget {
   // Draws only the Gaussians that selections keep (see selection.js). Returns a promise of the numbers that are left
   // after each.
   async select(selections) {
-    const { loader, renderer: { content } } = this, counts = await loader.ask({ select: selections });
-    if (content.sky) content.sky.key = null; // another part of the background may be visible
+    const counts = await this.loader.ask({ select: selections });
+    const sky = this.renderer.content?.sky; // there is no content after the graphics device was lost
+    if (sky) sky.key = null; // another part of the background may be visible
     this.changed();
     return counts;
   }

@@ -2,7 +2,7 @@
 // of Uint8Array, whose `length` is the number of bytes, or 0 if that is unknown. Only fetched files have an address.
 // Their streams have a method `cancel`, which ends the download at once, also while it waits for bytes.
 
-const FROM_DISK_TEXT = "a page opened from the disk may not read files; serve both, or drop the file on a player";
+const FROM_DISK_TEXT = "a page opened from the disk may not read files; serve both, or use a page of one file";
 // A sandbox without allow-same-origin makes every server, even the page's own, another site.
 const OPAQUE_FRAME_TEXT = "the sandbox of this page's frame forbids it; add allow-same-origin, or let the file's " +
   "server send Access-Control-Allow-Origin: *";

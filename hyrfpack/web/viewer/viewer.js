@@ -16,6 +16,8 @@ const INTERACTIONS = ["after-click", "always", "none"];
 const LOADINGS = ["eager", "lazy"];
 const RENDERER_TEXT = 'renderer must be the export `webgpu` of "hyrf-viewer/webgpu"; leave it out for WebGL 2.';
 const LAZY_MARGIN = "300px"; // a lazy scene is loaded when its container is this near to the window
+// The keys of `Navigation`, for screen readers. Others belong to the page.
+const KEYS_TEXT = "Arrow keys look around, W A S D Q E fly, plus and minus zoom.";
 const CANVAS_STYLE = { display: "block", width: "100%", height: "100%" };
 
 // Creates a viewer in an element. `options` are those that the constructor lists. Throws an Error with a message for
@@ -42,6 +44,7 @@ class Viewer {
     this.canvas.tabIndex = interaction === "none" ? -1 : 0;
     this.canvas.setAttribute("role", interaction === "none" ? "img" : "application");
     this.canvas.setAttribute("aria-label", title);
+    if (interaction !== "none") this.canvas.setAttribute("aria-description", KEYS_TEXT);
     const playerOptions = { workerAddress, streaming: STREAMING, maxGaussians, rendererClass: renderer };
     this.player = new Player(this.canvas, playerOptions);
     this.player.exposure = exposure;

@@ -146,11 +146,11 @@ class SceneReader {
     this.broken = this.ended = true;
   }
 
-  // Decodes the same bytes again, as splats if `plain`. A file that is still arriving is decoded at its end.
+  // Decodes the same bytes again, as splats if `plain`: of a file that is still arriving, what was decoded before.
   decodeAgain(plain) {
     this.repeats++;
     this.request.plain ||= plain;
-    if (this.ended) this.queueDecoding(this.broken);
+    if (this.ended || this.contents) this.queueDecoding(this.broken || !this.ended);
   }
 
   // Decodes the bytes so far, after any earlier decoding has ended. `partial` is true if the file is not complete.

@@ -10,8 +10,14 @@ const DIRECTION_DIGITS = 6;
 const MIN_SCENE_SIZE = 1e-30; // this limit and the next one are those of `hyrfpack edit`
 const MAX_WORLD_COORDINATE = 1e30;
 const AXIS_VECTORS = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] };
-// An action takes the place of an earlier one of the same option, unless one of these lies between.
-const SEPARATORS = { "crop-box": ["scale", "upright"], "max-scale": ["scale"], "min-opacity": [], up: ["upright"] };
+// An action takes the place of an earlier one of the same option, unless one of these lies between. A box is turned
+// about the direction that was stated before it.
+const SEPARATORS = {
+  "crop-box": ["scale", "upright"],
+  "max-scale": ["scale"],
+  "min-opacity": [],
+  up: ["upright", "crop-box"],
+};
 
 // Returns the index of the action that another one of the option would replace, or -1.
 export function findActive(actions, option) {

@@ -66,7 +66,7 @@ export class ViewsTool {
         go.title = go.ariaLabel = `Go to ${view.name}`;
         remove.title = remove.ariaLabel = `Remove ${view.name}`;
       };
-      Object.assign(name, { maxLength: 60, ariaLabel: "Name", onchange: rename });
+      Object.assign(name, { maxLength: 60, title: "Name", onchange: rename });
       rename();
       item.append(name, go, remove);
       return item;

@@ -138,7 +138,10 @@ export class SceneStream {
     if (look) this.view = { ticket: look.ticket, camera: cameraOf(look.view, this.scene) };
     if (gaussians) this.gaussians = gaussians;
     if (look || gaussians) this.isOutdated = true;
-    if (uploaded?.number === this.number) this.chunks[uploaded.chunk].get(uploaded.level).state = READY;
+    if (uploaded?.number === this.number) {
+      const level = this.chunks[uploaded.chunk].get(uploaded.level);
+      if (level.state === UPLOADING) level.state = READY;
+    }
     if (faded?.number === this.number) this.endFade(this.chunks[faded.chunk]);
     if (unusable) this.reject(this.parts[unusable.part].file, reasonOf({ message: unusable.reason }));
     if (again && this.scene) this.clear();
@@ -444,7 +447,7 @@ export class SceneStream {
     }
   }
 
-  // Records that a file cannot be used.
+  // Records that a file cannot be used. Levels that can be drawn need no fields any more, so they stay.
   reject({ file }, reason) {
     const part = this.parts.find((each) => each.file.file === file);
     if (part?.number === 0) return this.fail(`${file}: ${reason}`);
@@ -452,7 +455,10 @@ export class SceneStream {
     if (part) {
       part.isUnusable = true;
       const lost = this.chunks.filter((chunk) => this.partOf(chunk) === part).flatMap(({ levels }) => levels);
-      for (const level of lost) level.state = UNUSABLE;
+      for (const level of lost.filter(({ state }) => state !== READY)) {
+        this.drop(level);
+        level.state = UNUSABLE;
+      }
     } else {
       const [number, level] = this.places.get(file);
       this.chunks[number].get(level).state = UNUSABLE;
