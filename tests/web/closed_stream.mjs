@@ -3,11 +3,13 @@
 // Prints, as JSON, `late`: the number of requests for files after that; `refused`: for an answer that is longer than the
 // manifest says, and for one of a missing file, whether its request is cancelled; `partials`: the number of files whose
 // beginnings are kept after the requests for 100 files were cancelled one after the other; and `breaks`: how often the
-// connection breaks within a file before it is given up, if its request was cancelled 25 times before.
+// connection breaks within a file before it is given up, if its request was cancelled 25 times before; and `bytes`: of a
+// file of 10 bytes that was received twice.
 
 import { setTimeout as wait } from "node:timers/promises";
 
 import { copyManifest, requests, streamScene } from "./copied_scene.mjs";
+import { crc32 } from "../../hyrfpack/web/hyrf/crc.js";
 import { FileQueue } from "../../hyrfpack/web/viewer/stream/file_queue.js";
 
 const QUIET_MS = 500;
@@ -72,5 +74,15 @@ while (!isGivenUp && breaks < 100) {
   await wait(5);
   broken.resume();
 }
-console.log(JSON.stringify({ late, refused, partials: queue.partials.size, breaks }));
+
+const data = new Uint8Array(10), whole = { ...file, crc32: crc32(data).toString(16).padStart(8, "0") };
+let times = 0;
+const repeated = new FileQueue("http://host/", {
+  received: () => times++, failed: () => {}, changed: () => {}, send: async () => new Response(data),
+});
+for (const wanted of [1, 2]) {
+  repeated.want([whole]);
+  while (times < wanted) await wait(5);
+}
+console.log(JSON.stringify({ late, refused, partials: queue.partials.size, breaks, bytes: repeated.bytes }));
 process.exit();

@@ -48,6 +48,10 @@ def test_answers_of_files_that_cannot_be_used_are_cancelled(closed_stream: dict)
     assert closed_stream["refused"] == [200, 404]
 
 
+def test_a_file_that_is_fetched_again_counts_once(closed_stream: dict):
+    assert closed_stream["bytes"] == 10
+
+
 def test_few_beginnings_of_files_that_are_no_longer_wanted_are_kept(closed_stream: dict):
     assert closed_stream["partials"] == 32
 

@@ -202,8 +202,7 @@ class SceneReader {
 
   // Packs the parts of a merged file for a content. Returns the positions of all their Gaussians.
   decodeMerged(parts, content) {
-    const { name, scene, stage, plain } = this.request, frame = parts[0].model.config.frame;
-    if (plain) throw new Error("This device draws no merged models.");
+    const { name, scene, stage } = this.request, frame = parts[0].model.config.frame;
     const placed = parts.map(({ model }) => ({ model, place: placeOf(model.config.frame, frame) }));
     const count = parts.reduce((sum, { model }) => sum + model.count, 0);
     const own = scene ?? { ...modelScene(parts[0].model, name), ...stage };

@@ -28,9 +28,14 @@ export class FileQueue {
     this.requests = new Map(); // name of a file -> the AbortController of its request
     this.partials = new Map(); // name -> what was received of a file: {parts, length, attempts, breaks}
     this.unusable = new Set(); // names
-    this.bytes = 0; // that were received in all
+    this.lengths = new Map(); // name -> the number of bytes that were received, also of files that were dropped since
     this.losses = 0; // requests in a row without an answer
     this.retry = null; // the timer of the next requests
+  }
+
+  // The number of bytes that were received, of each file once.
+  get bytes() {
+    return [...this.lengths.values()].reduce((sum, length) => sum + length, 0);
   }
 
   // Whether the server did not answer the last request.
@@ -125,7 +130,7 @@ export class FileQueue {
         expectMore();
         partial.parts.push(bytes);
         partial.length += bytes.length;
-        this.bytes += bytes.length;
+        this.lengths.set(name, Math.max(partial.length, this.lengths.get(name) ?? 0));
         if (partial.length > size) refuse(`it is longer than the ${groupedDigits(size)} bytes that the manifest says`);
       });
     } catch (error) {

@@ -6,6 +6,7 @@
 //                  those of the scene, the predicted PSNR in dB, and a sentence, "" for none
 //     "problem"    detail: that sentence, when it has changed
 
+import { MAX_MANIFEST_BYTES } from "../../hyrf/manifest.js";
 import { Loader } from "../loader.js";
 import { decodeName } from "../source.js";
 import { StreamedFields } from "./streamed_fields.js";
@@ -15,7 +16,6 @@ export const DEFAULT_PHONE_GAUSSIANS = 500_000;
 const MIN_ADAPTED_GAUSSIANS = 100_000; // slow frames lower the budget no further
 const PHONE_QUERY = "(pointer: coarse) and (max-width: 600px), (pointer: coarse) and (max-height: 600px)";
 const MANIFEST_NAME = "scene.json";
-const MAX_MANIFEST_BYTES = 2 ** 24;
 const MIN_LOOK_INTERVAL_MS = 150; // between two choices of levels while the view moves
 // The least predicted PSNR in dB that each word describes.
 const DETAIL_WORDS_BY_PSNR_DB = [[40, "full"], [34, "high"], [28, "medium"], [0, "low"]];
