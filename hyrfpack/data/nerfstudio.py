@@ -182,9 +182,9 @@ def _check_scale_is_known(content: dict[str, Any], frame: dict[str, Any], file: 
 
     Scaling needs 'w', the calibrated width, or an angle of view, which counts only where no focal length is stated.
     """
-    entries = {name: value for name, value in {**content, **focal_entries(frame, content), **frame}.items() if value}
-    is_angle = "camera_angle_x" in entries and not entries.keys() & {"fl_x", "fl_y"}
-    if "w" not in entries and not is_angle:
+    stated = {name for name, value in focal_entries(frame, content).items() if value is not None}
+    is_angle = "camera_angle_x" in stated and stated.isdisjoint({"fl_x", "fl_y"})
+    if {**content, **frame}.get("w") is None and not is_angle:
         raise HyrfDataError(
             f"{file}: there is no 'w' and 'h', so that focal lengths cannot be scaled to the photos of another folder",
             fix="add the width and height of the calibration",

@@ -216,6 +216,18 @@ def test_masks_of_full_size_are_used_for_smaller_pictures(nerfstudio_folder, pic
     assert views[0].load().mask is None
 
 
+@pytest.mark.parametrize("angle", [None, 0.8])
+def test_focal_lengths_of_an_unknown_width_are_refused_for_smaller_pictures(nerfstudio_folder, pictures, angle):
+    root = nerfstudio_folder()
+    pictures(root / "images_2", [f"{index:03d}.png" for index in range(4)], size=(16, 12))
+    _edit_transforms(root, w=None, h=None, camera_angle_x=angle)
+    with pytest.raises(HyrfDataError, match="there is no 'w' and 'h', so that focal lengths cannot be scaled"):
+        load_scene(root, images="images_2")
+    if angle:
+        _edit_transforms(root, fl_x=None, fl_y=None, cx=None, cy=None)
+        assert load_scene(root, images="images_2").views[0].camera.fx == pytest.approx(8 / np.tan(angle / 2))
+
+
 def test_smaller_pictures_scale_the_intrinsics(nerfstudio_folder, pictures):
     root = nerfstudio_folder()
     pictures(root / "images_2", [f"{index:03d}.png" for index in range(4)], size=(16, 12))
