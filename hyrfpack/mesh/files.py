@@ -14,7 +14,6 @@ from hyrfpack.splats.placement import choose_local_origin, upright_rotation
 
 _LOG = logging.getLogger(__name__)
 
-MESH_EXTENSIONS = ("glb", "ply", "obj", "stl")
 MAX_STEP_RATIO = 1e-5  # Coarser steps of a .stl, as a ratio of the mesh's size, are reported.
 _UNLIT_EXTENSION = "KHR_materials_unlit"  # colours of photos have the light in them already
 
@@ -31,7 +30,7 @@ def encode_mesh(mesh: Mesh, extension: str, up: np.ndarray) -> bytes:
 
     Args:
         mesh: the mesh.
-        extension: one of MESH_EXTENSIONS.
+        extension: "glb", "ply", "obj" or "stl".
         up: (3,) unit vector that points up in the scene, world axes.
 
     Raises:

@@ -17,9 +17,10 @@ import hyrfpack
 from hyrfpack.cameras.capture import provenance_cameras
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.errors import HyrfError
+from hyrfpack.export.kinds import MESH_FILES
 from hyrfpack.format import save_model
 from hyrfpack.mesh import Mesh
-from hyrfpack.mesh.files import MESH_EXTENSIONS, encode_mesh
+from hyrfpack.mesh.files import encode_mesh
 from tools.safety.train_golden import DEMO_MODEL_FILE
 
 # A tetrahedron; the scene's up is -y, as in most reconstructions.
@@ -38,7 +39,7 @@ def read_mesh(data: bytes, extension: str) -> trimesh.Trimesh:
     return trimesh.load_scene(io.BytesIO(data), file_type=extension, process=False).to_mesh()
 
 
-@pytest.mark.parametrize("extension", MESH_EXTENSIONS)
+@pytest.mark.parametrize("extension", [kind.ending.split(".")[-1] for kind in MESH_FILES])
 def test_trimesh_reads_positions_in_world_units(extension):
     read = read_mesh(encode_mesh(TETRAHEDRON_MESH, extension, UP), extension)
     corners = np.asarray(read.vertices)[np.asarray(read.faces)]
