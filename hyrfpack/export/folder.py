@@ -42,7 +42,7 @@ from hyrfpack.scene import Scene
 from hyrfpack.splats.files import READABLE_ENDINGS, read_splats
 from hyrfpack.web.gallery import STYLE_FILE_NAME as GALLERY_STYLE_NAME
 from hyrfpack.web.gallery import Card, encode_gallery, encode_gallery_style
-from hyrfpack.web.html import encode_stage
+from hyrfpack.web.html import encode_views
 from hyrfpack.web.player import encode_element_script, encode_player, encode_player_files, encode_readme
 from hyrfpack.web.view import find_playable_file
 
@@ -124,7 +124,7 @@ def _write_player(
     if title is None:
         title = _name_folder(output.path) if source is None else name_model(source)
     content_name = poster_name = None
-    stages = {}
+    views = {}
     description, count = "A player of 3D scenes", 0
     if source is not None:
         source = find_playable_file(source)
@@ -132,7 +132,7 @@ def _write_player(
         count = content.count
         content_name, poster_name = _choose_file_names([source], is_gallery=False)[0]
         output.copy(content_name, source)
-        stages = {content_name: content.stage} if content.stage else {}
+        views = {content_name: content.views} if content.views else {}
         if content.poster is None:
             poster_name = None
         else:
@@ -147,7 +147,7 @@ def _write_player(
         content=content_name,
         poster=poster_name,
         description=description,
-        stages=stages,
+        views=views,
         in_folder=True,
         credit=credit,
         editable=editable,
@@ -245,10 +245,10 @@ def _write_gallery(
         cards.append(Card(_name_source(source), content_name, picture, content.count, content.length, content.quality))
     title = _name_folder(output.path) if title is None else title
     pairs = zip(cards, contents, strict=True)
-    stages = {card.content: content.stage for card, content in pairs if content.stage}
+    views = {card.content: content.views for card, content in pairs if content.views}
     for name, encoded in encode_player_files(editable).items():
         output.write(name, encoded)
-    page = encode_player(title, stages=stages, gallery=INDEX_NAME, in_folder=True, credit=credit, editable=editable)
+    page = encode_player(title, views=views, gallery=INDEX_NAME, in_folder=True, credit=credit, editable=editable)
     output.write(GALLERY_PLAYER_NAME, page)
     output.write(GALLERY_STYLE_NAME, encode_gallery_style())
     output.write(README_NAME, encode_readme(title, GALLERY_PLAYER_NAME, INDEX_NAME))
@@ -287,14 +287,14 @@ class _PlayableContent:
         length: size in bytes.
         poster: a picture of the scene, or None if none can be made.
         quality: quality of the model in words; empty if unknown.
-        stage: initial cameras for the page, see `hyrfpack.web.html.encode_stage`; None if there is no poster.
+        views: initial cameras for the page, see `hyrfpack.web.html.encode_views`; None if there is no poster.
     """
 
     count: int
     length: int
     poster: Image.Image | None
     quality: str = ""
-    stage: dict | None = None
+    views: dict | None = None
 
     @classmethod
     def read(cls, path: StrPath, data: Scene | None, *, with_quality: bool) -> _PlayableContent:
@@ -315,14 +315,14 @@ class _PlayableContent:
                 return cls(len(splats), length, None)
             viewpoint = Viewpoint.from_frame(frame.center, frame.scale)
             poster = render_splats_poster(splats, frame, viewpoint.camera, POSTER_LONGEST_SIDE_PIXELS)
-            stage = encode_stage([viewpoint.camera], viewpoint.up, viewpoint.center)
-            return cls(len(splats), length, poster, stage=stage)
+            views = encode_views([viewpoint.camera], viewpoint.up, viewpoint.center)
+            return cls(len(splats), length, poster, views=views)
         data = place_photos(describe_file(path), data)
         loaded = Source.read(path, data)
         quality = _describe_quality(path, loaded.all_parts, data) if with_quality else ""
         cameras = choose_page_cameras(loaded)
         poster = render_model_poster(loaded.all_parts, cameras[0], POSTER_LONGEST_SIDE_PIXELS)
-        return cls(len(loaded.all_parts), length, poster, quality, encode_stage(cameras, loaded.up, loaded.center))
+        return cls(len(loaded.all_parts), length, poster, quality, encode_views(cameras, loaded.up, loaded.center))
 
 
 def _describe_quality(path: StrPath, model: HybridModel | MergedModel, data: Scene | None) -> str:

@@ -198,12 +198,12 @@ def _scene_element(
         **facts,
         "tolerance": RenderSettings().cull_tolerance,
         "solid": list(solid),
-        **encode_stage(cameras, up, center),
+        **encode_views(cameras, up, center),
     }
     return json_element("scene", scene)
 
 
-def encode_stage(cameras: Sequence[Camera], up: np.ndarray, center: np.ndarray) -> dict:
+def encode_views(cameras: Sequence[Camera], up: np.ndarray, center: np.ndarray) -> dict:
     """Return the cameras, the upward direction and the centre of orbits for the player, ready for JSON.
 
     The arguments are those of `encode_model_page`.

@@ -36,7 +36,7 @@ def encode_player(
     poster: str | None = None,
     description: str = "A player of 3D scenes",
     fetches: str = ANY_SOURCE,
-    stages: Mapping[str, dict] | None = None,
+    views: Mapping[str, dict] | None = None,
     updates: str | None = None,
     gallery: str | None = None,
     in_folder: bool = False,
@@ -53,7 +53,7 @@ def encode_player(
         poster: address, relative to the page, of the picture that is shown while that file loads; None for none.
         description: description for those who share the page.
         fetches: sources that the page may fetch from, in the syntax of a content security policy.
-        stages: initial cameras for files, by the file's address relative to the page; see `html.encode_stage`.
+        views: initial cameras for files, by the file's address relative to the page; see `html.encode_views`.
         updates: address of a JSON file that says which snapshot of a training `content` is: {"snapshot": number from 1,
             0 while there is none, "step", "steps", "kind" of the run (see `Trainer`)}. The page requests it repeatedly
             and shows newer snapshots from the viewer's current viewpoint; an `editable` page shows only the first one.
@@ -68,12 +68,12 @@ def encode_player(
     Returns:
         The file, UTF-8. The same arguments give the same bytes.
     """
-    settings: dict = {"content": content, "title": escape_surrogates(title), "stages": stages or {}}
+    settings: dict = {"content": content, "title": escape_surrogates(title), "views": views or {}}
     if file is not None:
         settings["file"] = file
     if updates is not None:
         settings["updates"] = updates
-    texts = [json_element("content", settings)] if content is not None or stages else []
+    texts = [json_element("content", settings)] if content is not None or views else []
     if poster is not None:
         texts.append(f'<img id="poster" alt="" src="{html.escape(poster)}">')
     assemble = _assemble_page_in_folder if in_folder else assemble_player_page

@@ -71,7 +71,7 @@ def test_a_player_folder_has_a_page_the_file_a_poster_and_the_element(model_file
     assert file_names(folder) == PLAYER_FILES | {"scene.hyrf", "poster.jpg"}
     assert (folder / "scene.hyrf").read_bytes() == model_file.read_bytes()
     content = read_content_json(folder / "index.html")
-    assert (content["content"], content["title"]) == ("scene.hyrf", "room") and content["stages"]["scene.hyrf"][
+    assert (content["content"], content["title"]) == ("scene.hyrf", "room") and content["views"]["scene.hyrf"][
         "cameras"
     ]
     page = (folder / "index.html").read_text()
@@ -91,7 +91,7 @@ def test_a_player_of_splats_contains_the_file_unchanged(splats_file, tmp_path):
     assert (tmp_path / "p" / "scene.ply").read_bytes() == splats_file.read_bytes()
     assert np.asarray(Image.open(tmp_path / "p" / "poster.jpg")).std() > 5  # the poster is not uniform
     content = read_content_json(tmp_path / "p" / "index.html")
-    assert content["content"] == "scene.ply" and len(content["stages"]["scene.ply"]["cameras"]) == 1
+    assert content["content"] == "scene.ply" and len(content["views"]["scene.ply"]["cameras"]) == 1
 
 
 def test_a_player_without_a_scene_has_no_content(tmp_path):

@@ -27,7 +27,7 @@ export function streamScene(manifest, gaussians, receive, padding = 0) {
   const text = JSON.stringify(manifest) + " ".repeat(padding);
   const request = { manifest: Buffer.from(text), address: "http://host/scene.json", name: "scene" };
   const sorter = { add: () => {} };
-  const stream = new SceneStream({ ...request, stage: null, gaussians, maxRows: 4096 }, sorter, (message) => {
+  const stream = new SceneStream({ ...request, views: null, gaussians, maxRows: 4096 }, sorter, (message) => {
     if (message.error) throw new Error(message.error);
     if (message.swap) setTimeout(() => stream.handle({ faded: message.swap }));
     receive(message);

@@ -41,14 +41,14 @@ async function* stall() {
   await new Promise(() => {});
 }
 const stalled = createLoader(), address = "http://host/50%/scene.json";
-const failed = stalled.read({ name: "scene.json", address, stage: null, stream: stall() }).catch((error) => error);
+const failed = stalled.read({ name: "scene.json", address, views: null, stream: stall() }).catch((error) => error);
 stalled.dispose();
 const timeout = new Promise((done) => setTimeout(done, 2000, "none")), error = await Promise.race([failed, timeout]);
 
 async function* yieldManifest() {
   yield new TextEncoder().encode("{}");
 }
-createLoader().read({ name: "scene.json", address, stage: null, stream: yieldManifest() });
+createLoader().read({ name: "scene.json", address, views: null, stream: yieldManifest() });
 await new Promise((done) => setTimeout(done, 50));
 const folderName = posted.find(({ stream }) => stream)?.stream.name ?? null;
 

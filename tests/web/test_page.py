@@ -137,7 +137,7 @@ def test_a_hosted_player_may_fetch_from_the_web_and_a_served_one_only_from_its_s
 def test_a_player_page_refers_to_its_content_and_poster():
     page = encode_player("room", content="scene.hyrf", poster="poster.jpg", description="a & b").decode()
     assert (
-        '<script type="text/plain" id="content">{"content": "scene.hyrf", "title": "room", "stages": {}}</script>'
+        '<script type="text/plain" id="content">{"content": "scene.hyrf", "title": "room", "views": {}}</script>'
         in page
     )
     assert '<img id="poster" alt="" src="poster.jpg">' in page
@@ -261,6 +261,6 @@ def test_all_files_of_the_page_are_package_data():
 
 def test_a_player_page_contains_the_viewpoints_of_its_files():
     seen = {"cameras": [], "up": [0, -1, 0], "target": [0, 0, 0]}
-    page = encode_player("a", stages={"a </script>.hyrf": seen}).decode()
+    page = encode_player("a", views={"a </script>.hyrf": seen}).decode()
     (beside,) = re.findall(r'<script type="text/plain" id="content">([^<]*)</script>', page)
-    assert json.loads(beside) == {"content": None, "title": "a", "stages": {"a </script>.hyrf": seen}}
+    assert json.loads(beside) == {"content": None, "title": "a", "views": {"a </script>.hyrf": seen}}

@@ -28,7 +28,7 @@ from web.site import Site, drop_file
 from hyrfpack.cameras.view_sampling import shrink_camera
 from hyrfpack.scene import Camera
 from hyrfpack.splats.splats import Splats
-from hyrfpack.web.html import encode_stage
+from hyrfpack.web.html import encode_views
 from hyrfpack.web.player import encode_element_script, encode_player
 
 pytestmark = [pytest.mark.in_turn, pytest.mark.usefixtures("reset_window")]
@@ -124,9 +124,9 @@ def test_the_poster_of_the_element_lies_where_the_scene_is_drawn(browser: Browse
 
 def serve_page_with_poster(host: Site) -> None:
     camera = make_camera()
-    stage = encode_stage([camera, make_camera(1.5)], UP_DIRECTION, SCENE_CENTER)
+    views = encode_views([camera, make_camera(1.5)], UP_DIRECTION, SCENE_CENTER)
     host.files["/index.html"] = encode_player(
-        "room", content="some scene.hyrf", poster="poster.webp", stages={"some scene.hyrf": stage}
+        "room", content="some scene.hyrf", poster="poster.webp", views={"some scene.hyrf": views}
     )
     host.files["/poster.webp"] = host.files["/other.webp"] = make_poster(three_balls(camera), camera)
 

@@ -101,9 +101,9 @@ export class Loader {
 
   // Reads a file from an async iterable of its bytes, which are transferred to the worker. `length` is in bytes, and 0
   // if it is unknown.
-  async read({ name, scene, stage, plain = false, stream, length = stream.length }) {
+  async read({ name, scene, views, plain = false, stream, length = stream.length }) {
     const shown = this.expect(), source = stream[Symbol.asyncIterator]();
-    this.connection.post({ start: { name, scene, stage, plain } });
+    this.connection.post({ start: { name, scene, views, plain } });
     try {
       for (let part = 0;;) {
         const { done, value: bytes } = await Promise.race([source.next(), shown]); // `shown` may fail before the end

@@ -12,17 +12,17 @@ export const postToParent = (hyrf, message = "") => {
 };
 
 // Returns the cameras of a file in the page's folder, {cameras, up, target}, or null if the page has none for it.
-const findStage = (address, stages = {}) => {
+const findViews = (address, views = {}) => {
   const isAddressOf = (name) => new URL(encodeURI(name), document.baseURI).href === address;
-  return Object.entries(stages).find(([name]) => isAddressOf(name))?.[1] ?? null;
+  return Object.entries(views).find(([name]) => isAddressOf(name))?.[1] ?? null;
 };
 
 // Returns the file that the address or the page names: its address, null for none, "" for an invalid one; whether it is
-// the page's own; and its stage, null if the page has none. `served` and `parameters` are those of `openFirst`.
+// the page's own; and its views, null if the page has none. `served` and `parameters` are those of `openFirst`.
 export function findFirstFile(served, parameters) {
   const own = served?.content ? resolveAddress(served.content, "content") : null;
   const address = parameters.content ?? own;
-  return { address, isOwn: address === own, stage: address ? findStage(address, served?.stages) : null };
+  return { address, isOwn: address === own, views: address ? findViews(address, served?.views) : null };
 }
 
 export class Opener {
@@ -37,9 +37,9 @@ export class Opener {
   }
 
   // Opens the scene that the page or its address names, if there is one. `hasFile` is true if the page has a file, and
-  // `served` is the {content, title, stages, updates} of a hosted page, or null. `parameters` are those of parseSearch.
-  // `address` and `stage` are those of findFirstFile.
-  async openFirst(hasFile, served, parameters, { address, stage }) {
+  // `served` is the {content, title, views, updates} of a hosted page, or null. `parameters` are those of parseSearch.
+  // `address` and `views` are those of findFirstFile.
+  async openFirst(hasFile, served, parameters, { address, views }) {
     if (hasFile) {
       await this.player.load(readPayload(), element("background"));
       postToParent("load");
@@ -50,7 +50,7 @@ export class Opener {
     if (updates) return this.watchTraining(this, address, updates, served.title);
     if (address) {
       const name = parameters.title ?? (parameters.content ? null : served.title);
-      return this.open(async () => ({ ...(await fetchedFile(address)), stage }), name);
+      return this.open(async () => ({ ...(await fetchedFile(address)), views }), name);
     }
     element("loading").hidden = true;
     this.invites = parameters.content === null;

@@ -22,7 +22,7 @@ const IGNORED_TEXTS = {
 
 // Shows the picture that the address names, or else the page's, and returns it. The page's is one of its own file from
 // the first camera; if the address names another file or camera, it is removed. Returns null without a picture.
-function showPoster(parameters, embedded, { isOwn, stage }) {
+function showPoster(parameters, embedded, { isOwn, views }) {
   const named = namedCamera(parameters);
   const isFirstView = named === null || named === "1", picture = element("poster");
   const address = embedded ? null : parameters.poster; // the policy of a page of one file forbids other pictures
@@ -31,7 +31,7 @@ function showPoster(parameters, embedded, { isOwn, stage }) {
     const image = picture ?? Object.assign(new Image(), { id: "poster", alt: "" });
     if (address) image.src = address;
     document.body.append(image);
-    return new Poster(image, element("view"), isFirstView ? (embedded ?? stage)?.cameras[0] : null);
+    return new Poster(image, element("view"), isFirstView ? (embedded ?? views)?.cameras[0] : null);
   }
   return null;
 }
@@ -162,7 +162,7 @@ function start({ startEditing = () => {}, streaming = null, watchTraining }) {
   });
   const title = embedded ? (parameters.title ?? embedded.title) : document.title;
   const opener = new Opener(player, panel, { title, watchTraining });
-  const isCredited = embedded || isOwn || firstFile.stage;
+  const isCredited = embedded || isOwn || firstFile.views;
   const { file } = embedded ?? (isOwn && served) ?? {};
   const editor = startEditing({ player, navigation, panel, opener, file });
   if (parameters.exposure) player.exposure = parameters.exposure;

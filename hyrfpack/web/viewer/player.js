@@ -146,7 +146,7 @@ export class Player extends EventTarget {
     }
   }
 
-  // Opens a file, {name, stream, address}; `address` is needed for manifests of scene folders. `stage` has its
+  // Opens a file, {name, stream, address}; `address` is needed for manifests of scene folders. `views` has its
   // {cameras, up, target} if they are known. `update` is true for a newer version of the scene that is shown: then the
   // eye stays, and only errors are reported. `origin` is what the page knows of the file; its loader keeps it.
   async open(file) {
@@ -160,7 +160,7 @@ export class Player extends EventTarget {
 
   // Loads a file and shows it.
   async receive({
-    name = "", scene = null, stage = null, stream, address = null, picture = null, update = false, origin = null,
+    name = "", scene = null, views = null, stream, address = null, picture = null, update = false, origin = null,
   }) {
     const isStreamed = address !== null && this.streaming?.isManifest(address);
     let loader = null;
@@ -178,7 +178,7 @@ export class Player extends EventTarget {
       Object.assign(loader, { picture, part: 0, scene, remark: "", update, origin });
       this.next = loader;
       this.failure = null;
-      await loader.read({ name, scene, stage, plain: scene?.plain ?? false, stream, address });
+      await loader.read({ name, scene, views, plain: scene?.plain ?? false, stream, address });
     } catch (error) {
       stream.cancel?.();
       if (loader && this.loader === loader) {

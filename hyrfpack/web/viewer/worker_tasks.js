@@ -3,7 +3,7 @@
 // Every message has the number of the `reader` that it is for, or from.
 //
 // Messages to the worker:
-//     {start: {name, scene, stage, plain}}   a file follows; `scene` or `stage` (cameras, up, target) if the page has
+//     {start: {name, scene, views, plain}}   a file follows; `scene` or `views` (cameras, up, target) if the page has
 //                                            them; `plain`: decode it as splats
 //     {bytes}                                the next piece of the file
 //     {end} or {broken}                      the file is complete, or no more of it can be read
@@ -166,7 +166,7 @@ class SceneReader {
 
   // Decodes the file and posts its content.
   async decode(partial) {
-    const { file, request: { name, scene, stage, plain } } = this, all = file.gather();
+    const { file, request: { name, scene, views, plain } } = this, all = file.gather();
     const bytes = partial && this.broken ? all.subarray(0, this.decodedLength || file.length) : all;
     const content = { number: ++this.contents, repeats: this.repeats, whole: !partial };
     this.reportProgress("unpacking", 0);
@@ -175,7 +175,7 @@ class SceneReader {
       positions = this.decodeMerged(await readFileParts(bytes), content);
     } else if (file.isModel) {
       const model = await readFile(bytes, { partial });
-      content.scene = { ...(scene ?? { ...modelScene(model, name), ...stage }), exposure: model.exposure };
+      content.scene = { ...(scene ?? { ...modelScene(model, name), ...views }), exposure: model.exposure };
       positions = model.positions;
       if (plain) {
         this.reportProgress("unpacking", 1);
@@ -190,7 +190,7 @@ class SceneReader {
       rejectOtherFiles(bytes);
       const splats = await this.readSplats(name, bytes);
       if (scene) convertToScene(splats, scene);
-      content.scene = scene ?? { ...splatsScene(splats, name), ...stage };
+      content.scene = scene ?? { ...splatsScene(splats, name), ...views };
       positions = splats.positions;
       content.splats = packSplats(splats);
     }
@@ -202,10 +202,10 @@ class SceneReader {
 
   // Packs the parts of a merged file for a content. Returns the positions of all their Gaussians.
   decodeMerged(parts, content) {
-    const { name, scene, stage } = this.request, frame = parts[0].model.config.frame;
+    const { name, scene, views } = this.request, frame = parts[0].model.config.frame;
     const placed = parts.map(({ model }) => ({ model, place: placeOf(model.config.frame, frame) }));
     const count = parts.reduce((sum, { model }) => sum + model.count, 0);
-    const own = scene ?? { ...modelScene(parts[0].model, name), ...stage };
+    const own = scene ?? { ...modelScene(parts[0].model, name), ...views };
     const described = placed.map(({ model: { exposure }, place }) => ({ exposure, place }));
     const sortNear = own.near * Math.min(...placed.map(({ place }) => place.scale)); // the nearest one of all parts
     content.scene = { ...own, count, sortNear, exposure: null, parts: described };

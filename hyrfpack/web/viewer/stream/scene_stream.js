@@ -4,7 +4,7 @@
 // the scene: a level needs the fields of its part only until it is evaluated.
 //
 // Messages to the worker, beside those in worker_tasks.js; `number` is that of the content:
-//     {stream: {manifest, address, name, stage, gaussians, maxRows}}   open the scene with the text `manifest` from
+//     {stream: {manifest, address, name, views, gaussians, maxRows}}   open the scene with the text `manifest` from
 //                                            `address`, with at most `gaussians` in a view, in textures of at most
 //                                            `maxRows` rows
 //     {look: {ticket, view}}                 choose levels for a view
@@ -274,7 +274,7 @@ export class SceneStream {
   // Sends the content, with the levels that were read.
   async postContent() {
     this.isOpening = true;
-    const { number, manifest, request: { name, stage } } = this, [scene, ...rest] = this.parts;
+    const { number, manifest, request: { name, views } } = this, [scene, ...rest] = this.parts;
     const sent = Promise.resolve(), parts = [];
     scene.sent = sent;
     const { source, packed: { model, exposure, place } } = await scene.pack();
@@ -287,7 +287,7 @@ export class SceneStream {
     const described = modelScene({ ...source, count: manifest.gaussians }, manifest.title || name);
     // Gaussians are projected from the nearest near plane of all parts on; the order omits those before their own.
     const near = described.near * Math.min(1, ...parts.map((part) => part.place.scale)), sortNear = described.near;
-    this.scene = { ...described, ...stage, exposure, near, sortNear, isStreamed: true };
+    this.scene = { ...described, ...views, exposure, near, sortNear, isStreamed: true };
     if (rest.length) {
       const others = rest.map(({ number: part }) => parts.find((other) => other.part === part));
       const maps = others.map((part) => ({ exposure: part?.exposure ?? null, place: part?.place ?? place }));

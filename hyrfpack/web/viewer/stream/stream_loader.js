@@ -43,13 +43,13 @@ class StreamLoader extends Loader {
   }
 
   // Opens the scene whose manifest `stream` yields.
-  async read({ name, address, stage, stream }) {
+  async read({ name, address, views, stream }) {
     const shown = this.expect();
     const manifest = await Promise.race([this.gather(stream), shown]); // `shown` fails if the loader is disposed of
     const { gaussians } = this, maxRows = this.player.renderer.largest[1];
     const [folder] = new URL(address).pathname.split("/").slice(-2).map(decodeName);
     const ownName = name === MANIFEST_NAME && folder ? folder : name;
-    this.post({ stream: { manifest, address, name: ownName, stage, gaussians, maxRows } });
+    this.post({ stream: { manifest, address, name: ownName, views, gaussians, maxRows } });
     return shown;
   }
 
