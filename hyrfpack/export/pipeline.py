@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -46,7 +47,7 @@ from hyrfpack.format import describe_file, find_model
 from hyrfpack.format.input_folder import find_input_folder
 from hyrfpack.format.scene_folder import SceneFolder, as_single_file
 from hyrfpack.lock import exclusive_folder
-from hyrfpack.outputs import Outputs
+from hyrfpack.outputs import Outputs, StrPath
 from hyrfpack.parallel import has_numba
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.scene import Scene
@@ -169,21 +170,14 @@ def _export_file(
             loaded = replace(loaded, cameras=[(view.name, fit_to_file(view)) for view in data.train])
         with context.open_progress("export") as progress:
             if kind in (*MESH_FILES, *COLLISION_FILES):
-                return _write_mesh(loaded, target, kind, config, overwrite, progress)
+                return _choose_mesh_writer(kind, target)(loaded, target, kind, config, overwrite, progress)
             if scene is not None:
                 return _export_levels(loaded, scene, Path(target), kind, config, overwrite, progress)
             return _export_gaussians(loaded, Path(target), kind, config, overwrite, progress)
 
 
-def _write_mesh(
-    loaded: Source,
-    target: str | os.PathLike[str],
-    kind: FileKind,
-    config: ExportConfig,
-    overwrite: bool,
-    progress: Progress,
-) -> ExportReport:
-    """Write a mesh or a collision mesh. Only meshes need Numba, so other exports do without importing it."""
+def _choose_mesh_writer(kind: FileKind, target: StrPath) -> Callable[..., ExportReport]:
+    """Return `write_mesh` or `write_collision_mesh`. Only meshes need Numba, so other exports do not import it."""
     if not has_numba():
         raise HyrfError(
             f"{target}: meshes are extracted by Numba, which is missing or does not work here",
@@ -191,8 +185,7 @@ def _write_mesh(
         )
     from hyrfpack.export.meshes import write_collision_mesh, write_mesh
 
-    write = write_mesh if kind in MESH_FILES else write_collision_mesh
-    return write(loaded, target, kind, config, overwrite, progress)
+    return write_mesh if kind in MESH_FILES else write_collision_mesh
 
 
 def _export_gaussians(

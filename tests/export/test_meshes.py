@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 from commands import succeeded
-from scenes import ring, small_model
+from scenes import QUIET_CONTEXT, ring, small_model
 
 import hyrfpack
 from hyrfpack.cameras.capture import provenance_cameras
@@ -175,3 +175,10 @@ def test_a_collision_file_needs_the_package_that_reduces_triangles(tmp_path, mon
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
     with pytest.raises(HyrfError, match=r"needs fast-simplification; run 'pip install \"hyrfpack\[mesh\]\"'"):
         hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "demo.collision.glb")
+
+
+def test_only_meshes_need_numba(monkeypatch, tmp_path):
+    monkeypatch.setattr("hyrfpack.export.pipeline.has_numba", lambda: False)
+    with pytest.raises(HyrfError, match=r"x.obj: meshes are extracted by Numba.*'hyrfpack doctor'"):
+        hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "x.obj", context=QUIET_CONTEXT)
+    hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "x.points.ply", context=QUIET_CONTEXT)
