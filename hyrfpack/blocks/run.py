@@ -27,7 +27,7 @@ from hyrfpack.data import PictureCache
 from hyrfpack.data.cache import memory_bytes
 from hyrfpack.data.preset import detect_preset
 from hyrfpack.device import describe_device
-from hyrfpack.errors import HyrfError
+from hyrfpack.errors import HyrfError, HyrfFormatError, HyrfTrainingError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.format.parts import load_model_or_parts
 from hyrfpack.format.run_folder import BLOCKS_FOLDER, CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
@@ -241,6 +241,8 @@ class _BlockRun:
             with self.context.open_progress("blocks", interruptible=False) as progress:
                 return self._merge(metrics, progress, overwrite=self.resume or self.overwrite)
         except HyrfError as error:
+            if isinstance(error, HyrfTrainingError | HyrfFormatError):  # merging again would fail in the same way
+                raise
             kept = f"the trained blocks are kept, {resuming(self.overwrite)} merges them"
             raise error.with_text(fix=f"{error.fix}; {kept}") from error
 

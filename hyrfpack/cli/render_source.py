@@ -56,7 +56,8 @@ class RenderSource:
             if allow_partial:
                 raise HyrfError(f"{path}: splats are read whole", fix="leave out --allow-partial")
             splats = read_splats(path)
-            drawable = Drawable.from_splats(splats, WeightedSplats.from_splats(splats, str(path)).frame, device)
+            frame = WeightedSplats.from_splats(splats, str(path)).frame
+            drawable = Drawable.from_splats(splats, frame, device, str(path))
             return cls(path, device, precision, None, splats=drawable)
         if is_scene(path):
             if allow_partial:

@@ -96,8 +96,9 @@ def find_listed_photos(
         lens = lens(file, header) if callable(lens) else lens
         photos.append(PosedPhoto(pictures.photo_name(file, name), file, header, lens, pose))
     notes = matches.notes + missing_photos_notes(path, photos, missing, where, matches.ambiguous)
-    masks = [find_mask_folder(root, folder.name) for root in (folder.parent, path)]
-    return photos, next((mask for mask in masks if mask.is_dir()), masks[-1]), notes
+    masks = find_mask_folder(path, folder.name)
+    beside = masks if folder == path else find_mask_folder(folder.parent, folder.name)
+    return photos, beside if beside.is_dir() else masks, notes
 
 
 def read_sidecar_points(

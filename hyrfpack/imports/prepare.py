@@ -73,7 +73,7 @@ def prepare_model(
     progress(TaskEvent("choosing viewpoints", 0.0))
     splats = clamp_harmonics(splats, name)
     weighted = WeightedSplats.from_splats(splats, name)
-    original = Drawable.from_splats(splats, weighted.frame, device)
+    original = Drawable.from_splats(splats, weighted.frame, device, name)
     chosen, validation, test = _choose_cameras(weighted, original, config, cameras)
     how = "sampled" if cameras is None else "given"
     _LOG.info(

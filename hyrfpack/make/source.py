@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -43,12 +44,14 @@ class LoadSettings:
         read = partial(load_scene, path, images=self.images, max_size=size)
         if self.test_every is not None:
             return read(test_every=self.test_every)
+        with suppress(HyrfDataError):  # of a single photo, none is left to train on
+            scene = read(test_every=DEFAULT_TEST_EVERY)
+            if len(group_faces(scene.views)) >= MIN_SPLIT_PHOTOS:
+                return scene
         scene = read(test_every=0)
         photos = group_faces(scene.views)
         if scene.test or len(photos) < MIN_HELD_OUT_PHOTOS:
             return scene
-        if len(photos) >= MIN_SPLIT_PHOTOS:
-            return read(test_every=DEFAULT_TEST_EVERY)
         inner = choose_inner_view(scene)
         return read(held_out=[view.name for photo in photos if inner in photo for view in photo])
 

@@ -123,14 +123,16 @@ def run_training_stage(
         kept = (
             f"the trained model is kept: it was trained {target}, and only the compression is repeated"
             if stage_cache.state.facts("training", inputs) is not None
-            else f"the training that was begun {target} is resumed, and only the compression has the new target size"
+            else f"the training that was begun {target} is resumed, and only the compression is another"
         )
         _LOG.info(f"{kept}; name another work folder (`work`) to train again")
 
     def execute(resuming: bool) -> tuple[dict, list[str]]:
         if not (resuming and _is_run_finished(run)):
-            _LOG.info(f"training: {describe_runs(scene, config)}; on {describe_device(context.choose_device())}")
             resume = resuming and is_begun(run)
+            has_teachers = resume and (run / CHECKPOINT_FILE).is_file()
+            runs = describe_runs(scene, replace(config, virtual_views=config.virtual_views and not has_teachers))
+            _LOG.info(f"training: {runs}; on {describe_device(context.choose_device())}")
             if not resume:
                 remove_preview(stage_cache)  # it shows other photos or settings
             _train(stage_cache, scene, config, resume, observer, context)

@@ -214,7 +214,7 @@ def _belongs_to_photo_set(folder: Path) -> bool:
 
 
 def _has_poses(folder: Path) -> bool:
-    """Return whether a folder holds poses, as far as names show it: no .csv, .xml or .out of any name is opened."""
+    """Return whether a folder holds poses under a name that only poses have, unlike many .csv and .xml files."""
     if not _entry_names(folder).isdisjoint((*COLMAP_TABLE_NAMES, *POSE_FILE_NAMES)):
         return True
     models = [folder / name for name in COLMAP_MODEL_FOLDERS]

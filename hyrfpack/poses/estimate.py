@@ -290,7 +290,14 @@ class _PoseEstimation:
             return Path(self.masks)
         if self.photos.is_file():
             return None
-        return locate_masks(self.out / "images" if in_place else self.photos)
+        masks = locate_masks(self.out / "images" if in_place else self.photos)
+        if masks is None or in_place or not is_same_path(masks, self.out / "masks"):
+            return masks
+        if not any(name.startswith("masks/") for name in self.output.owned_files()):
+            _LOG.warning(
+                f"{masks}: these masks are not read, as the scene's own belong there; name another folder for the scene"
+            )
+        return None
 
     def _claim_work_folder(self) -> None:
         """Create the folder of products in progress, or take over the folder of an interrupted call."""

@@ -47,6 +47,7 @@ class Drawable:
         splats: Splats,
         frame: Frame,
         device: torch.device = torch.device("cpu"),  # noqa: B008 - a constant
+        name: str = "the splats",
     ) -> Drawable:
         """Convert splats to the local units of a frame and copy them to a device.
 
@@ -62,8 +63,8 @@ class Drawable:
         if not is_near.all():
             x, y, z = splats.positions[~is_near][0].tolist()
             raise HyrfDataError(
-                f"the Gaussian at ({x:.3g}, {y:.3g}, {z:.3g}) is too far from the others, in units of their extent "
-                f"({frame.scale:.3g})",
+                f"{name}: the Gaussian at ({x:.3g}, {y:.3g}, {z:.3g}) is more than 3e38 times as far away as the "
+                f"others are spread ({frame.scale:.3g})",
                 fix="remove it from the file",
             )
         scales = splats.scales / np.float32(frame.scale)

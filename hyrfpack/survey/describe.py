@@ -139,7 +139,7 @@ def _describe(path: Path, report_progress: Progress) -> PhotoSurvey:
     problems += find_blur_problems(median_sharpness, blurred, folder)
     problems += find_light_problems(measurements, log_luminances, stops, folder, scene)
     if scene is None:
-        problems += find_zoom_problems(facts) + find_mask_problems(folder, facts)
+        problems += find_zoom_problems(facts) + find_mask_problems(folder, photos, facts)
     notes = (
         list(scene.notes) if scene is not None else describe_headers(facts) + raw_photos_notes(list_raw_photos(folder))
     )

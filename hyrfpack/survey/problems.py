@@ -16,7 +16,7 @@ from hyrfpack.data.folder import PhotoFacts
 from hyrfpack.data.masks import find_masks, locate_masks
 from hyrfpack.data.quality import MIN_SHARPNESS
 from hyrfpack.data.unusable import format_file_names
-from hyrfpack.errors import suggest_command
+from hyrfpack.errors import HyrfDataError, suggest_command
 from hyrfpack.progress import Progress, TaskEvent
 from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
 from hyrfpack.survey.measure import PIXELS_PROGRESS, PhotoMeasurement, relative_name
@@ -203,13 +203,23 @@ def find_zoom_problems(facts: list[PhotoFacts]) -> list[str]:
     ]
 
 
-def find_mask_problems(folder: Path, facts: Sequence[PhotoFacts]) -> list[str]:
-    """Describe masks that fit no photo; for photos with poses, `load_scene` reports them."""
+def find_mask_problems(folder: Path, photos: list[Path], facts: Sequence[PhotoFacts]) -> list[str]:
+    """Describe masks that fit no photo; for photos with poses, `load_scene` reports them.
+
+    Args:
+        folder: the folder of the photos.
+        photos: all photos.
+        facts: the headers of those that were read, at least one.
+    """
     masks = locate_masks(folder)
     if masks is None:
         return []
-    photos = [(Path(os.path.relpath(fact.path, folder)).as_posix(), fact.size) for fact in facts]
-    matches = find_masks(masks, photos, set())
+    sizes = {fact.path: fact.size for fact in facts}  # Those of other photos are not known, and taken for the first.
+    named = [(Path(os.path.relpath(photo, folder)).as_posix(), sizes.get(photo, facts[0].size)) for photo in photos]
+    try:
+        matches = find_masks(masks, named, set())
+    except HyrfDataError as error:  # a mask cannot be read
+        return [str(error)]
     is_shared = len(set(matches.by_photo.values())) == 1 < len(matches.by_photo)  # noted, but no problem
     return [] if is_shared else matches.notes
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -177,8 +178,19 @@ def test_a_collision_file_needs_the_package_that_reduces_triangles(tmp_path, mon
         hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "demo.collision.glb")
 
 
-def test_only_meshes_need_numba(monkeypatch, tmp_path):
+def test_a_mesh_without_numba_is_refused(monkeypatch, tmp_path):
     monkeypatch.setattr("hyrfpack.export.pipeline.has_numba", lambda: False)
     with pytest.raises(HyrfError, match=r"x.obj: meshes are extracted by Numba.*'hyrfpack doctor'"):
         hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "x.obj", context=QUIET_CONTEXT)
-    hyrfpack.export_model(DEMO_MODEL_FILE, tmp_path / "x.points.ply", context=QUIET_CONTEXT)
+
+
+@pytest.mark.integration
+def test_other_exports_do_without_numba(tmp_path):
+    script = (
+        "import sys; sys.modules['numba'] = None\n"  # so that importing it fails
+        "import hyrfpack\n"
+        "hyrfpack.export_model(*sys.argv[1:], context=hyrfpack.RunContext(progress=None))\n"
+    )
+    target = tmp_path / "x.points.ply"
+    subprocess.run([sys.executable, "-c", script, str(DEMO_MODEL_FILE), str(target)], check=True)
+    assert target.stat().st_size > 0

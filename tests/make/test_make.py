@@ -77,6 +77,21 @@ def test_the_description_of_the_training_names_teacher_runs(steps, start, posed)
     assert stages.describe_runs(load_scene(posed), TrainConfig(steps)).startswith(start)
 
 
+def test_a_training_that_resumes_from_its_checkpoint_announces_no_teacher_runs(posed, tmp_path, monkeypatch, caplog):
+    def interrupt(scene, run, config, **_):
+        run.mkdir(exist_ok=True)
+        (run / "checkpoint.pt").write_bytes(b"of step 2,500")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stages, "train_model", interrupt)
+    monkeypatch.setattr("hyrfpack.train.teachers.usual_steps", lambda pixels: 9)
+    for start in ("training: 3 teacher runs of 1,000 steps, then 9 steps on ", "training: 9 steps on "):
+        caplog.clear()
+        with pytest.raises(Stopped):
+            make_scene(posed, tmp_path / "scene.hyrf")
+        assert any(message.startswith(start) for message in caplog.messages)
+
+
 def test_scoring_after_the_last_step_is_part_of_the_training_progress():
     messages: list[StageEvent] = []
     reporter = Reporter(["training"], messages.append)

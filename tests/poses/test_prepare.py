@@ -14,10 +14,12 @@ from made_up_photos import PHOTO_SIZE, write_photos
 from PIL import Image, TiffImagePlugin
 
 import hyrfpack
+from hyrfpack.config.poses import PosesConfig
 from hyrfpack.copying import copy_file
 from hyrfpack.data.folder import list_photos, read_photo_facts
 from hyrfpack.data.pictures import read_pixels
 from hyrfpack.data.unusable import unreadable_sentences
+from hyrfpack.poses import estimate
 from hyrfpack.poses.job import Device, Job
 from hyrfpack.poses.prepare import (
     Photo,
@@ -422,3 +424,17 @@ def test_photos_of_two_cameras_some_of_them_rotated_become_one_scene(tmp_path):
     }
     assert len(json.loads((tmp_path / "scene" / "poses.json").read_text())["made"]) == len(known)
     assert read_photo_facts(tmp_path / "scene" / "images" / "photo01.jpg").size == PHOTO_SIZE
+
+
+def test_masks_in_the_place_of_the_scenes_own_are_not_taken_for_those_of_the_photos(tmp_path, caplog):
+    (tmp_path / "input").mkdir()
+    (tmp_path / "masks").mkdir()
+    found = []
+    for out in (tmp_path, tmp_path / "scene"):
+        estimation = estimate._PoseEstimation(
+            photos=tmp_path / "input", out=out, config=PosesConfig(), masks=None, overwrite=False,
+            progress=ignore_progress,
+        )  # fmt: skip
+        found.append(estimation._find_mask_folder(in_place=False))
+    assert found == [None, tmp_path / "masks"]
+    assert caplog.text.count("masks: these masks are not read") == 1

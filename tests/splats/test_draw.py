@@ -31,7 +31,9 @@ def test_the_center_of_a_splat_shows_its_color_times_its_opacity():
 
 def test_a_splat_that_is_too_far_for_float32_is_refused():
     splats = one_splat([[0, 0, 0]], position=(0, 1e29, 0))
-    with pytest.raises(HyrfDataError, match=r"the Gaussian at \(0, 1e\+29, 0\) is too far from the others.*remove it"):
+    with pytest.raises(
+        HyrfDataError, match=r"the Gaussian at \(0, 1e\+29, 0\) is more than 3e38 times as far.*remove it"
+    ):
         Drawable.from_splats(splats, Frame((0.0, 0.0, 0.0), 1e-20, (1.0, 1.0, 1.0)))
 
 

@@ -181,6 +181,19 @@ def test_one_mask_for_all_photos_is_no_problem(photos):
     assert [problem for problem in describe_photos(photos).problems if " mask" in problem] == []
 
 
+def test_masks_of_photos_that_were_not_opened_are_no_problem(photos, monkeypatch):
+    for number, photo in enumerate(sorted(photos.glob("*.jpg"))):
+        save_photo(photos / "masks" / f"{photo.stem}.png", random_rectangles(number))
+    monkeypatch.setattr("hyrfpack.survey.measure.MAX_OPENED_PHOTOS", 3)
+    assert [problem for problem in describe_photos(photos).problems if " mask" in problem] == []
+
+
+def test_a_damaged_mask_is_a_problem_and_no_error(photos):
+    (photos / "masks").mkdir()
+    (photos / "masks" / "lens.png").write_bytes(b"no picture")
+    assert "lens.png" in find_problem(describe_photos(photos), "masks")
+
+
 def test_masks_without_matching_photos_are_detected(photos):
     for number in range(24):
         save_photo(photos / "masks" / f"{number:03d}.jpg.png", random_rectangles(number))

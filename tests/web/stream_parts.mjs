@@ -5,7 +5,8 @@
 // Prints, as JSON, `levels`: the number of levels that the page was sent; `most`: the largest number of further parts
 // whose fields it held at a time; `again`: the number of parts that it was sent again; `early`: the number of levels that
 // came without the fields of their part; `dropped`: the number of levels that were not evaluated when their fields were
-// dropped; and `kept`: the number of Gaussians that are drawn after a part has become unusable.
+// dropped; `kept`: the number of Gaussians that are drawn after the file of a part has become unusable; and `left`: of
+// these, after the graphics device was lost.
 
 import { readFileSync } from "node:fs";
 import { setTimeout as wait } from "node:timers/promises";
@@ -48,7 +49,11 @@ const stream = streamScene(manifest, Number(budget), ({ content, part, chunk, st
 while (!state?.isComplete) await wait(POLL_MS);
 stream.handle({ gaussians: 1e9 });
 while (!state.isComplete || state.gaussians !== manifest.gaussians) await wait(POLL_MS);
-stream.handle({ unusable: { part: 1, reason: "its fields are gone." } });
+stream.reject(stream.parts[1].file, "it is gone.");
 while (!state.isComplete || !state.problem) await wait(POLL_MS);
+const kept = state.gaussians, answer = { levels: levels.size, ...counts, kept };
+state = null;
+stream.handle({ again: true }); // after the graphics device was lost
+while (!state?.isComplete) await wait(POLL_MS);
 stream.close();
-console.log(JSON.stringify({ levels: levels.size, ...counts, kept: state.gaussians }));
+console.log(JSON.stringify({ ...answer, left: state.gaussians }));

@@ -76,3 +76,4 @@ def test_the_memory_for_fields_of_parts_has_a_limit(parts_folder: Path, budget: 
     assert (answer["again"] > 0) == (most_parts < PART_COUNT - 1)
     assert answer["early"] == answer["dropped"] == 0
     assert answer["kept"] == PART_COUNT * GAUSSIANS_PER_PART  # what can be drawn needs no fields any more
+    assert answer["left"] == (PART_COUNT - 1) * GAUSSIANS_PER_PART

@@ -22,6 +22,7 @@ import math
 import warnings
 import zipfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ from hyrfpack.splats.formats.palette import build_palette, find_nearest_entries
 from hyrfpack.splats.formats.smallest_three import drop_largest, restore_largest
 from hyrfpack.splats.formats.validation import build_valid_splats
 from hyrfpack.splats.names import SOG_META_NAME as META_NAME
-from hyrfpack.splats.splats import Splats, clamp_harmonics
+from hyrfpack.splats.splats import MAX_ABS_HARMONIC, Splats, clamp_harmonics
 
 _PICTURES_BY_GROUP = {
     "means": ("means_l.webp", "means_u.webp"),
@@ -76,6 +77,7 @@ def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
     Raises:
         HyrfDataError: there are more than 67,108,864 Gaussians.
     """
+    splats = clamp_harmonics(splats, "SOG")
     bundle = io.BytesIO()
     with zipfile.ZipFile(bundle, "w") as archive:
         for name, data in encode_files(splats).items():
@@ -93,7 +95,8 @@ def encode_files(splats: Splats, group_sizes: Sequence[int] = ()) -> dict[str, b
         group_sizes: sizes of groups of consecutive splats. Groups keep their order, and the Morton curve orders the
             splats in each group. Without any, all splats are one group.
     """
-    splats = clamp_harmonics(splats, "SOG")  # Distances of larger ones would overflow float32.
+    # Distances of larger ones would overflow float32.
+    splats = replace(splats, harmonics=splats.harmonics.clip(-MAX_ABS_HARMONIC, MAX_ABS_HARMONIC))
     count = len(splats)
     if count > _MAX_GAUSSIANS:
         raise HyrfDataError(

@@ -16,7 +16,7 @@ const INTERACTIONS = ["after-click", "always", "none"];
 const LOADINGS = ["eager", "lazy"];
 const RENDERER_TEXT = 'renderer must be the export `webgpu` of "hyrf-viewer/webgpu"; leave it out for WebGL 2.';
 const LAZY_MARGIN = "300px"; // a lazy scene is loaded when its container is this near to the window
-// The keys of `Navigation`, for screen readers. Others belong to the page.
+// The keys that move the eye, for screen readers; `press` handles others.
 const KEYS_TEXT = "Arrow keys look around, W A S D Q E fly, plus and minus zoom.";
 const CANVAS_STYLE = { display: "block", width: "100%", height: "100%" };
 

@@ -146,7 +146,8 @@ class SceneReader {
     this.broken = this.ended = true;
   }
 
-  // Decodes the same bytes again, as splats if `plain`: of a file that is still arriving, what was decoded before.
+  // Decodes the file again, as splats if `plain`. Of a file that is still arriving, it decodes what has arrived, if
+  // that was enough for a first layer.
   decodeAgain(plain) {
     this.repeats++;
     this.request.plain ||= plain;

@@ -8,12 +8,13 @@ class Level {
   constructor(level, file, rowCount) {
     Object.assign(this, { level, file, rowCount });
     this.usedAt = 0; // when it last suited a view
+    this.isFinal = false; // whether it cannot be read again
     this.clear();
   }
 
   // Forgets its Gaussians.
   clear() {
-    if (this.state !== UNUSABLE) this.state = ABSENT;
+    if (this.state !== UNUSABLE) this.state = this.isFinal ? UNUSABLE : ABSENT;
     this.rows = []; // of the textures
     this.positions = null; // of its Gaussians, 3 N
     this.packed = null; // the arrays of its Gaussians (see pack.js), before the first picture

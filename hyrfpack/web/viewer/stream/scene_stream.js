@@ -143,7 +143,7 @@ export class SceneStream {
       if (level.state === UPLOADING) level.state = READY;
     }
     if (faded?.number === this.number) this.endFade(this.chunks[faded.chunk]);
-    if (unusable) this.reject(this.parts[unusable.part].file, reasonOf({ message: unusable.reason }));
+    if (unusable) this.reject(this.parts[unusable.part].file, reasonOf({ message: unusable.reason }), true);
     if (again && this.scene) this.clear();
     if (look || gaussians || uploaded || faded || again) this.schedule();
   }
@@ -447,17 +447,19 @@ export class SceneStream {
     }
   }
 
-  // Records that a file cannot be used. Levels that can be drawn need no fields any more, so they stay.
-  reject({ file }, reason) {
+  // Records that a file cannot be used, or that the device cannot draw it, if `isRefused`. Otherwise levels that were
+  // evaluated stay: they need no fields any more, until they are dropped.
+  reject({ file }, reason, isRefused = false) {
     const part = this.parts.find((each) => each.file.file === file);
     if (part?.number === 0) return this.fail(`${file}: ${reason}`);
     this.problems.set(file, reason);
     if (part) {
       part.isUnusable = true;
       const lost = this.chunks.filter((chunk) => this.partOf(chunk) === part).flatMap(({ levels }) => levels);
-      for (const level of lost.filter(({ state }) => state !== READY)) {
-        this.drop(level);
-        level.state = UNUSABLE;
+      for (const level of lost) {
+        if (level.state === UPLOADING) this.drop(level);
+        if (level.state === READY && !isRefused) level.isFinal = true;
+        else level.state = UNUSABLE;
       }
     } else {
       const [number, level] = this.places.get(file);
