@@ -123,7 +123,7 @@ def run_training_stage(
         kept = (
             f"the trained model is kept: it was trained {target}, and only the compression is repeated"
             if stage_cache.state.facts("training", inputs) is not None
-            else f"the training that was begun {target} is resumed, and only the compression is another"
+            else f"the training that was begun {target} is resumed, and only the compression changes"
         )
         _LOG.info(f"{kept}; name another work folder (`work`) to train again")
 
