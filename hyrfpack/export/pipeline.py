@@ -181,7 +181,7 @@ def _choose_mesh_writer(kind: FileKind, target: StrPath) -> Callable[..., Export
     if not has_numba():
         raise HyrfError(
             f"{target}: meshes are extracted by Numba, which is missing or does not work here",
-            fix="install it ('hyrfpack doctor' tells what is wrong), or export Gaussians",
+            fix="install it ('hyrfpack doctor' shows what is wrong), or export Gaussians",
         )
     from hyrfpack.export.meshes import write_collision_mesh, write_mesh
 

@@ -192,8 +192,8 @@ export class Player extends EventTarget {
     }
   }
 
-  // Rejects the promises of `settled` if there is no picture and none will come. After a load that another one has
-  // replaced, one may come.
+  // Rejects the promises of `settled` if no picture is shown and no load is left that could show one. If another load
+  // has replaced this one, that one settles them.
   giveUp(error) {
     if (this.loaded || this.next || error instanceof SupersededError) return;
     this.failure = error;
