@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +68,7 @@ def camera_from_numbers(numbers: Sequence[Any]) -> Camera:
     Raises:
         TypeError, ValueError, OverflowError: a number is missing or not valid.
     """
+    check_json_numbers(numbers)
     width, height, fx, fy, cx, cy, *pose = numbers
     lens = dict(zip(INTRINSICS_KEYS, (width, height, fx, fy, cx, cy), strict=True))
     return camera_from_json({**lens, "camera_from_world": np.reshape(pose, (3, 4))})
@@ -177,6 +178,13 @@ def _parse_transforms_frame(frame: dict[str, Any], shared: dict[str, Any], name:
     size = {"width": item["w"], "height": item["h"], "fx": focal[0], "fy": focal[1]}
     camera = camera_from_json({**item, **size, "camera_from_world": np.linalg.inv(world_from_camera)})
     return str(item.get("file_path", name)), camera
+
+
+def check_json_numbers(values: Iterable[Any]) -> None:
+    """Raise TypeError unless all values are numbers of JSON: `float` also converts texts and booleans."""
+    for value in values:
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise TypeError(f"{value!r:.100} is not a number")
 
 
 def _finite_float(value: Any) -> float:

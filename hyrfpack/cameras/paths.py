@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
-from hyrfpack.cameras.files import INTRINSICS_KEYS, camera_from_json, round_number
+from hyrfpack.cameras.files import INTRINSICS_KEYS, camera_from_json, check_json_numbers, round_number
 from hyrfpack.rotations import IDENTITY, rotation_matrix
 from hyrfpack.scene import Camera
 
@@ -139,6 +140,8 @@ class Viewpoint:
             KeyError: a key is missing.
             TypeError, ValueError, OverflowError: a value is not valid.
         """
+        rows, lists = stored["camera_from_world"], (stored[key] for key in ("center", "up", "intrinsics", "arc"))
+        check_json_numbers((stored["width"], stored["height"], *chain(*rows, *lists)))
         center, up = np.array(stored["center"], np.float64), np.array(stored["up"], np.float64)
         camera = camera_from_json({**stored, **dict(zip(INTRINSICS_KEYS[2:], stored["intrinsics"], strict=True))})
         first, last = (float(value) for value in stored["arc"])

@@ -24,7 +24,7 @@ from hyrfpack.format.metadata import Metadata, gaussian_limit, read_metadata
 from hyrfpack.format.part_names import list_parts
 from hyrfpack.format.parts import write_parts
 from hyrfpack.format.run_folder import find_model
-from hyrfpack.format.scene_folder import SceneFolder, is_scene
+from hyrfpack.format.scene_folder import SceneFolder, is_scene, refuse_fraction
 from hyrfpack.format.sections import NON_PARAMETER_SECTIONS, POSITIONS, SECTION_CONTENTS, group_and_layer
 from hyrfpack.format.shared import read_provenance
 from hyrfpack.format.versions import lowest_minor_version
@@ -238,11 +238,7 @@ def load_parts(path: str | os.PathLike[str], fraction: float | None = None) -> l
     The arguments and the errors are those of `load_model`.
     """
     if is_scene(path):
-        if fraction is not None:
-            raise HyrfFormatError(
-                f"{path}: a scene folder has levels in place of layers, so that no fraction of it can be read",
-                fix="leave out `fraction`",
-            )
+        refuse_fraction(path, fraction)
         scene = SceneFolder(path)
         models, names = parts_of(scene.load()), [part.name for part in scene.manifest.parts]
         return list(zip(names, models, scene.read_provenances(), strict=True))

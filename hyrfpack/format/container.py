@@ -20,7 +20,7 @@ from functools import partial
 from typing import Any, BinaryIO
 
 from hyrfpack.errors import HyrfFormatError
-from hyrfpack.format.run_folder import SCENE_MANIFEST_FILE, find_model
+from hyrfpack.format.run_folder import find_model, is_scene_manifest
 
 MAGIC = b"\x89HYRF\r\n\n"
 MAJOR_VERSION = 1
@@ -155,7 +155,7 @@ class Container:
         """
         path = find_model(path)
         name = os.fspath(path)
-        if path.name == SCENE_MANIFEST_FILE:
+        if is_scene_manifest(path):
             raise HyrfFormatError(
                 f"{name}: this is a scene of several files, and one file is needed",
                 fix="join it with 'hyrfpack decompress' first",

@@ -11,7 +11,7 @@ from hyrfpack.format.container import Container
 from hyrfpack.format.exposure_header import read_exposure_header
 from hyrfpack.format.metadata import read_metadata
 from hyrfpack.format.part_names import open_parts
-from hyrfpack.format.scene_folder import SceneFolder, is_scene
+from hyrfpack.format.scene_folder import SceneFolder, is_scene, refuse_fraction
 from hyrfpack.format.sections import EXPOSURE, NON_PARAMETER_SECTIONS, PART_NAMES, SECTION_CONTENTS, group_and_layer
 from hyrfpack.format.shared import read_provenance, read_section
 
@@ -111,6 +111,7 @@ def describe_file(path: str | os.PathLike[str], fraction: float | None = None) -
         ('compact', '1.1', 'META')
     """
     if is_scene(path):
+        refuse_fraction(path, fraction)
         return describe_scene(path)
     with Container.open(path, SECTION_CONTENTS, fraction) as container:
         if PART_NAMES not in container.entries:

@@ -20,7 +20,9 @@ PREPARED_FILES = (PILOTS_FILE, PILOT_CHECKPOINT_FILE, *TEACHER_FILES)
 METRICS_FILE = "metrics.json"
 BLOCKS_FOLDER = "blocks"  # of a run in blocks, a folder for each block
 BLOCKS_JOURNAL_FILE = f"{BLOCKS_FOLDER}/blocks.json"  # see `hyrfpack.blocks.journal`
-SCENE_MANIFEST_FILE = "scene.json"  # of a scene folder, see `hyrfpack.format.scene_folder`
+# The manifest of a scene folder, and the name of its format, see `hyrfpack.format.scene_manifest`.
+SCENE_MANIFEST_FILE, SCENE_FORMAT_NAME = "scene.json", "hyrf-scene"
+MAX_MANIFEST_BYTES = 1 << 24
 FINISH_RUN_ADVICE = "finish it by running its 'hyrfpack train' command again with `resume=True`"
 
 
@@ -56,17 +58,34 @@ class RunStatus:
 
 def is_run_folder(path: str | os.PathLike[str]) -> bool:
     """Return whether a path is the folder of a training run, finished or not."""
-    return any(_has_file(path, name) for name in (MODEL_FILE, CHECKPOINT_FILE))
+    return _has_file(path, MODEL_FILE) or _is_unfinished_run(path)
 
 
-def is_prepared(folder: Path) -> bool:
+def is_prepared(folder: str | os.PathLike[str]) -> bool:
     """Return whether a folder holds what runs before the training itself have left, so that the run can be resumed."""
     return any(_has_file(folder, name) for name in PREPARED_FILES)
+
+
+def _is_unfinished_run(folder: str | os.PathLike[str]) -> bool:
+    """Return whether a folder holds what an interrupted run leaves, so that the run can be resumed."""
+    return is_prepared(folder) or any(_has_file(folder, name) for name in (CHECKPOINT_FILE, BLOCKS_JOURNAL_FILE))
+
+
+def is_scene_manifest(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file is called `scene.json` and names the format; other programs write files of this name."""
+    if os.path.basename(path) != SCENE_MANIFEST_FILE or not os.path.isfile(path):
+        return False
+    try:
+        with open(path, "rb") as file:
+            return SCENE_FORMAT_NAME.encode() in file.read(MAX_MANIFEST_BYTES + 1)
+    except OSError:
+        return False
 
 
 def find_model(path: str | os.PathLike[str]) -> Path:
     """Return the path of a `.hyrf` file: `path` itself, or the model if `path` is the folder of a training run.
 
+    The model of a run comes first, if the folder has a manifest of a scene, too.
     Of a scene folder, it is the path of the manifest.
 
     Raises:
@@ -83,12 +102,17 @@ def find_model(path: str | os.PathLike[str]) -> Path:
         return path
     if _has_file(path, MODEL_FILE):
         return path / MODEL_FILE
-    if _has_file(path, SCENE_MANIFEST_FILE):
+    if is_scene_manifest(path / SCENE_MANIFEST_FILE):
         return path / SCENE_MANIFEST_FILE
-    if _has_file(path, CHECKPOINT_FILE):
+    if _is_unfinished_run(path):
         raise HyrfFormatError(f"{path}: {describe_unfinished_run(read_run_status(path))}", fix=FINISH_RUN_ADVICE)
     if not os.access(path, os.X_OK):
         raise HyrfFormatError(f"{path}: permission to read the folder is denied", fix="check its permissions")
+    if _has_file(path, SCENE_MANIFEST_FILE):
+        raise HyrfFormatError(
+            f"{path / SCENE_MANIFEST_FILE}: this is not the manifest of a scene folder, and there is no {MODEL_FILE}",
+            fix="name a .hyrf file, or copy the whole folder of the scene again",
+        )
     raise HyrfFormatError(
         f"{path}: this folder holds no {MODEL_FILE}",
         fix="name a .hyrf file, or a folder that 'hyrfpack train' wrote",

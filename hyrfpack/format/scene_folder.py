@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from hyrfpack.errors import HyrfFormatError, short_reason
 from hyrfpack.format.container import Container, open_regular_file, raw_bytes_limit, read_container
 from hyrfpack.format.metadata import read_metadata
-from hyrfpack.format.run_folder import name_model
+from hyrfpack.format.run_folder import MODEL_FILE, is_scene_manifest, name_model
 from hyrfpack.format.scene_manifest import (
     FORMAT_NAME,
     MANIFEST_NAME,
@@ -42,15 +42,27 @@ COPY_AGAIN_FIX = "copy the whole folder again, or split the model again"
 
 
 def is_scene(path: StrPath) -> bool:
-    """Return whether a path names a scene folder, its manifest or a .zip of it."""
+    """Return whether a path names a scene folder, its manifest or a .zip of it.
+
+    The folder of a run is none, even if it has a manifest, too: as for `find_model`, its own model comes first.
+    """
     path = Path(path)
-    if not (path.is_dir() or path.name == MANIFEST_NAME or _is_zip(path)):
-        return False
-    try:  # Other programs write files of this name, too.
+    if not _is_zip(path):
+        return is_scene_manifest(_find_manifest(path)) and not os.path.isfile(path / MODEL_FILE)
+    try:
         with closing(_SceneFiles(path)) as files:
             return FORMAT_NAME.encode() in files.read(MANIFEST_NAME, MAX_MANIFEST_BYTES)
     except HyrfFormatError:
         return False
+
+
+def refuse_fraction(path: StrPath, fraction: float | None) -> None:
+    """Raise HyrfFormatError if a fraction of a scene folder is asked for."""
+    if fraction is not None:
+        raise HyrfFormatError(
+            f"{path}: a scene folder has levels in place of layers, so that no fraction of it can be read",
+            fix="leave out `fraction`",
+        )
 
 
 class _SceneFiles:
@@ -67,7 +79,7 @@ class _SceneFiles:
         self._prefix = ""  # the folder within the .zip, "" or "name/"
         self._opened: tuple[int, zipfile.ZipFile] | None = None  # the archive and the process that opened it
         if self.is_folder:
-            self.path = path.parent if path.name == MANIFEST_NAME and not path.is_dir() else path
+            self.path = _find_manifest(path).parent
         else:
             self.path = path
             with _add_path_to_errors(path):
@@ -313,8 +325,13 @@ def as_single_file(path: StrPath) -> Iterator[Path]:
         yield joined
 
 
+def _find_manifest(path: Path) -> Path:
+    """Return the path of the manifest that a path names, or of the one in the folder that it names."""
+    return path if path.name == MANIFEST_NAME and not os.path.isdir(path) else path / MANIFEST_NAME
+
+
 def _is_zip(path: Path) -> bool:
-    return path.suffix.lower() == ".zip" and path.is_file()
+    return path.suffix.lower() == ".zip" and os.path.isfile(path)
 
 
 def _find_prefix(archive: zipfile.ZipFile) -> str:

@@ -20,15 +20,15 @@ from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import MAX_FILE_BYTES
 from hyrfpack.format.metadata import MAX_GAUSSIANS, MAX_NESTING_DEPTH, is_too_deep, writer_name
 from hyrfpack.format.part_names import ONE_PART_NAME, check_part_names, reject_constant
+from hyrfpack.format.run_folder import MAX_MANIFEST_BYTES
+from hyrfpack.format.run_folder import SCENE_FORMAT_NAME as FORMAT_NAME
 from hyrfpack.format.run_folder import SCENE_MANIFEST_FILE as MANIFEST_NAME
 from hyrfpack.format.sections import MAX_PARTS
 from hyrfpack.format.shared import is_file_name
 
-FORMAT_NAME = "hyrf-scene"
 # The two major versions differ, so that an older reader refuses a scene of several parts. Otherwise it would draw all
 # chunks with the fields of one part.
 ONE_PART_VERSION, PARTS_VERSION = (1, 0), (2, 0)
-MAX_MANIFEST_BYTES = 1 << 24
 MAX_CHUNKS = 1 << 16
 MAX_ERROR_RADII = 16
 MAX_CAMERAS = 1024

@@ -10,6 +10,7 @@ import re
 import struct
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.container import Container, Entry, Section, write_container
@@ -39,7 +40,7 @@ def refer_to_section(entry: Entry, file_name: str) -> Section:
 
 def has_shared_sections(container: Container) -> bool:
     """Return whether sections of a file lie in another file."""
-    return any(tag in container.entries and container.entries[tag].codec == CODEC_SHARED for tag in SHARED_SECTIONS)
+    return any(map(partial(_is_reference, container), SHARED_SECTIONS))
 
 
 def open_shared(container: Container) -> Container:
@@ -52,8 +53,8 @@ def open_shared(container: Container) -> Container:
     """
     references = {
         tag: _read_reference(container, tag)
-        for tag, entry in container.entries.items()
-        if entry.codec == CODEC_SHARED and tag in container
+        for tag in container.entries
+        if _is_reference(container, tag) and tag in container
     }
     if not references:
         return container
@@ -74,7 +75,7 @@ def open_shared(container: Container) -> Container:
 
 def read_section(container: Container, tag: str) -> Section:
     """Read a section of a file, or the section of another file that it refers to."""
-    return (open_shared(container) if container.entries[tag].codec == CODEC_SHARED else container)[tag]
+    return (open_shared(container) if _is_reference(container, tag) else container)[tag]
 
 
 def read_provenance(container: Container) -> dict:
@@ -101,12 +102,17 @@ def self_contained_bytes(container: Container) -> bytes:
     return write_container(sections, minor=lowest_minor_version(sections, metadata.config))
 
 
+def _is_reference(container: Container, tag: str) -> bool:
+    """Return whether a file has a section that refers to another file; other types are skipped, or refused if read."""
+    return tag in SHARED_SECTIONS and tag in container.entries and container.entries[tag].codec == CODEC_SHARED
+
+
 def _read_reference(container: Container, tag: str) -> tuple[str, int]:
     """Return the name of the file that a section refers to, and the checksum of the section there."""
     section = container[tag]
     data = bytes(section.data)
     name = data[_CHECKSUM_STRUCT.size :].decode("latin-1")
-    if tag not in SHARED_SECTIONS or section.raw_length != len(data) or not is_file_name(name):
+    if section.raw_length != len(data) or not is_file_name(name):
         raise _damaged_error(container, f"section '{tag}' refers to no file of its folder")
     return name, _CHECKSUM_STRUCT.unpack_from(data)[0]
 

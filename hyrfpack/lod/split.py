@@ -25,7 +25,7 @@ from hyrfpack.format.decode import decode_container
 from hyrfpack.format.info import describe_file
 from hyrfpack.format.part_names import ONE_PART_NAME, list_parts
 from hyrfpack.format.parts import decode_parts
-from hyrfpack.format.run_folder import find_model, name_model
+from hyrfpack.format.run_folder import find_model, is_run_folder, name_model
 from hyrfpack.format.scene_folder import SceneFolder, is_scene
 from hyrfpack.format.scene_manifest import (
     MANIFEST_NAME,
@@ -144,6 +144,11 @@ def split_model(
             f"{source}: this is a scene of several files already", fix="split the model from which it was made"
         )
     path, target = find_model(source), Path(target)
+    if is_run_folder(target):
+        raise HyrfError(
+            f"{target}: this folder holds a training run, whose model would be read in place of the scene",
+            fix="name another folder",
+        )
     shared_names = _name_shared_files(path)
     Outputs(path, scene=data, overwrite=True).folder(target, [MANIFEST_NAME, *shared_names])
     facts = describe_file(path)

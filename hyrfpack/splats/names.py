@@ -32,4 +32,4 @@ def find_sog_folder(path: str | os.PathLike[str]) -> Path | None:
     """Return the folder of an unbundled SOG, given the folder or its meta.json; None for a file."""
     path = Path(path)
     folder = path.parent if path.name == SOG_META_NAME else path
-    return folder if folder.is_dir() else None
+    return folder if os.path.isdir(folder) else None

@@ -99,7 +99,10 @@ def test_a_provenance_is_read_back():
     assert PhotoCameras.from_provenance({**stored, "background_stride": 7}).background_spacing == pytest.approx(7 / 90)
 
 
-@pytest.mark.parametrize("cameras", [7, [[1, 2, 3]], [[32, 32, 0, 1, 1, 1, *range(12)]], {"a": 1}, None, "none"])
+FORGED_CAMERAS = [[32, 32, value, 1, 1, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0] for value in (0, "700", True, None)]
+
+
+@pytest.mark.parametrize("cameras", [7, [[1, 2, 3]], *([camera] for camera in FORGED_CAMERAS), {"a": 1}, None, "none"])
 def test_invalid_cameras_count_as_missing(cameras):
     coarse = provenance_cameras([along_z(-2.0)])
     assert PhotoCameras.from_provenance({"cameras": cameras}).cameras == ()

@@ -249,6 +249,8 @@ def test_parts_with_and_without_antialiasing_are_refused_in_one_line(tmp_path):
     for read in (load_merged_model, load_parts, describe_file):
         with pytest.raises(HyrfFormatError, match=r"merged.hyrf: some of its parts are antialiased and others are not"):
             read(path)
+    with pytest.raises(ValueError, match="antialiased"):
+        minimal_reader.read_parts(path.read_bytes())
     with pytest.raises(HyrfFormatError, match="some of its parts are antialiased and others are not"):
         encode_parts([("a", files[0]), ("b", files[1])])
 

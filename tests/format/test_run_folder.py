@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,10 @@ from scenes import small_model
 import hyrfpack
 from hyrfpack.errors import HyrfFormatError
 from hyrfpack.format.run_folder import find_model, is_run_folder, read_run_status
+from hyrfpack.format.scene_folder import is_scene
 from hyrfpack.splats.files import read_splats
 from hyrfpack.train.checkpoint import save_checkpoint
+from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
 
 GAUSSIAN_POSITIONS = [[0.0, 0, 0], [0.3, 0, 0]]
 
@@ -53,6 +56,37 @@ def test_a_file_path_and_a_run_folder_select_a_model(run_folder):
         find_model(run_folder) == run_folder / "model.hyrf" and find_model(str(run_folder)) == run_folder / "model.hyrf"
     )
     assert find_model("elsewhere/a.hyrf") == Path("elsewhere/a.hyrf")
+
+
+@pytest.mark.parametrize("name", ["pilots.json", "pilot.pt", "teacher-1.hyrf", "blocks/blocks.json"])
+def test_a_run_that_was_stopped_before_its_first_checkpoint_has_not_finished(tmp_path, name):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("{}")
+
+    assert is_run_folder(tmp_path)
+    with pytest.raises(HyrfFormatError, match="the run has not finished; finish it by running its 'hyrfpack train'"):
+        find_model(tmp_path)
+
+
+def test_the_model_of_a_run_comes_before_a_scene_in_its_folder(run_folder):
+    """A scene that was split from an older model of the run would be read otherwise."""
+    shutil.copytree(GOLDEN_SCENE_FOLDER, run_folder, dirs_exist_ok=True)
+
+    assert find_model(run_folder) == run_folder / "model.hyrf" and not is_scene(run_folder)
+    assert is_scene(run_folder / "scene.json")
+    assert len(hyrfpack.load_model(run_folder)) == hyrfpack.describe_file(run_folder)["gaussians"]
+    assert len(hyrfpack.load_model(run_folder)) == len(GAUSSIAN_POSITIONS)
+
+
+@pytest.mark.parametrize("text", ["", '{"metadata": {"version": 4.5}}'])
+def test_a_manifest_of_another_program_is_named_as_none_of_a_scene(tmp_path, text):
+    (tmp_path / "scene.json").write_text(text)
+
+    for call in (find_model, hyrfpack.load_model, hyrfpack.describe_file):
+        with pytest.raises(HyrfFormatError, match="scene.json: this is not the manifest of a scene folder, and there"):
+            call(tmp_path)
+    with pytest.raises(HyrfFormatError, match="scene.json: "):
+        hyrfpack.load_model(tmp_path / "scene.json")
 
 
 def test_another_folder_is_refused_with_what_to_specify(tmp_path):

@@ -191,6 +191,6 @@ def test_a_caller_that_changes_provenances_changes_no_later_ones():
 
 
 def test_no_fraction_of_a_scene_folder_is_read(tmp_path):
-    for call in (load_model, partial(repack, target=tmp_path / "x.hyrf")):
+    for call in (load_model, describe_file, partial(repack, target=tmp_path / "x.hyrf")):
         with pytest.raises(HyrfFormatError, match="has levels in place of layers.*leave out `fraction`"):
             call(GOLDEN_SCENE_FOLDER, fraction=0.5)

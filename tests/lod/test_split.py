@@ -490,6 +490,14 @@ def test_a_scene_json_of_another_program_makes_no_scene(tmp_path):
         SceneFolder(tmp_path)
 
 
+def test_a_scene_is_not_written_into_the_folder_of_a_run(tmp_path):
+    save_model(small_model(np.zeros((3, 3))), tmp_path / "model.hyrf")
+
+    with pytest.raises(HyrfError, match="holds a training run.*name another folder"):
+        split_model(tmp_path / "model.hyrf", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["model.hyrf"]
+
+
 def test_a_scene_is_refused_as_a_source(folder, tmp_path):
     assert "a scene of several files already" in refused("split", folder, "-o", tmp_path / "scene")
     assert not (tmp_path / "scene").exists()

@@ -163,6 +163,7 @@ def read_parts(data: bytes) -> list[tuple[str, Any]]:
     require(raw_total <= min(1024 * len(data) + 3 * 2**24, 2**34), "the parts are too large")
     parts = [read(file) for file in files]
     require(sum(part[0]["gaussians"] for part in parts) <= 32 * len(data) + 2**18, "too many Gaussians")
+    require(len({part[0]["config"]["antialiased"] for part in parts}) == 1, "antialiased differs between parts")
     return list(zip(listed, parts, strict=True))
 
 
@@ -290,11 +291,10 @@ def follow_references(sections: dict[str, Section], folder: dict[str, bytes]) ->
     references = {
         name: section
         for name, section in sections.items()
-        if section.codec == 12 and section.whole and name in KNOWN_SECTION_TYPES
+        if section.codec == 12 and section.whole and name in {"EXPO", *FIELD_GROUPS}
     }
     names = set()
     for section in references.values():
-        require(section.name in {"EXPO", *FIELD_GROUPS}, f"{section.name}: codec 12 not allowed here")
         require(section.raw_length == section.stored_length > 4, f"{section.name}: wrong raw length")
         names.add(section.read()[4:])
     require(len(names) < 2, "references to several files")
@@ -371,9 +371,13 @@ def read_metadata(section: Section) -> dict[str, Any]:
 
 def parse_json(text: bytes) -> Any:
     try:
-        return json.loads(text.decode("utf-8"))
+        return json.loads(text.decode("utf-8"), parse_constant=refuse_constant)
     except RecursionError:  # Python's parser calls itself for each level of nesting
         raise ValueError("JSON: too deep") from None
+
+
+def refuse_constant(name: str) -> None:
+    raise ValueError(f"JSON: {name}")
 
 
 def check_keys(value: Any, keys: set[str], *optional: str) -> None:

@@ -2,7 +2,7 @@
 
 import { Container, MAX_PARTS, PART_NAMES_TYPE, partType, rawBytesLimit } from "./container.js";
 import { HyrfFormatError, rejectDamaged, rejectNewer } from "./errors.js";
-import { CODEC_SHARED } from "./shared.js";
+import { isReference } from "./shared.js";
 
 const CODEC_NAMES = 0;
 const CODEC_FILE = 10;
@@ -66,8 +66,8 @@ export const openParts = (container) => {
     if (entry.codec !== CODEC_FILE || entry.raw !== entry.stored) rejectNewer(`section '${type}' is no file`);
     const part = new Container(container.stored(type), false);
     if (part.entries.has(PART_NAMES_TYPE)) rejectDamaged(`section '${type}' is a merged file itself`);
-    for (const { codec, raw } of part.entries.values()) {
-      if (codec === CODEC_SHARED) rejectDamaged(`section '${type}' refers to another file`);
+    for (const { type: inner, raw } of part.entries.values()) {
+      if (isReference(part, inner)) rejectDamaged(`section '${type}' refers to another file`);
       declared += raw;
     }
     return { name, container: part };

@@ -10,7 +10,7 @@ import { FEATURES_PER_ROW, decoderSize, tableRows } from "./grids.js";
 import { decodeGroups, decoderGroups, readTableGroups, tableGroups } from "./groups.js";
 import { decodeLattice, latticePositions } from "./lattice.js";
 import { readMetadata } from "./metadata.js";
-import { openParts, readPartNames } from "./parts.js";
+import { openParts } from "./parts.js";
 import { decodeFloat16, decodeFloat32, decodeMinMax, decodeVectors } from "./plain.js";
 import { decodeResiduals, residualColumns } from "./residuals.js";
 import { CODEC_SHARED, attachShared, explainShared, sharedFileName } from "./shared.js";
@@ -93,7 +93,7 @@ export const readFile = async (bytes, { partial = false, openFile } = {}) => {
   const container = new Container(bytes, partial), name = sharedFileName(container);
   if (name !== null && openFile) attachShared(container, name, await openFile(name));
   if (!container.entries.has(PART_NAMES_TYPE)) return readModel(container);
-  throw new HyrfFormatError(`The file holds ${readPartNames(container).length} merged models; use readParts.`);
+  throw new HyrfFormatError("The file holds merged models; use readParts.");
 };
 
 /** See `readParts` of index.js. @type {typeof import("./index.js").readParts} */

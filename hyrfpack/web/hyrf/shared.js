@@ -68,16 +68,25 @@ export const explainShared = ({ name }, read) => {
 };
 
 /**
+ * Returns whether a section refers to another file. Other types are skipped, or refused where they are read.
+ * @param {Container} container
+ * @param {string} type
+ */
+export const isReference = (container, type) =>
+  SHARED_TYPES.includes(type) && container.entries.get(type)?.codec === CODEC_SHARED;
+
+/**
  * Lists the references of the available sections: the file's name, and the checksum of the section in it.
  * @param {Container} container
  * @returns {{type: string, name: string, checksum: number}[]}
  */
 const listReferences = (container) => {
-  const entries = [...container.entries.values()].filter(({ codec }) => codec === CODEC_SHARED);
-  return entries.filter(({ type }) => container.has(type)).map(({ type, stored, raw }) => {
+  const types = [...container.entries.keys()].filter((type) => isReference(container, type) && container.has(type));
+  return types.map((type) => {
+    const { stored, raw } = /** @type {import("./container.js").Entry} */ (container.entries.get(type));
     const data = stored <= CHECKSUM_BYTES + MAX_NAME_LENGTH ? container.stored(type) : new Uint8Array(0);
     const name = String.fromCharCode(...data.subarray(CHECKSUM_BYTES));
-    if (!SHARED_TYPES.includes(type) || raw !== stored || !isFileName(name)) {
+    if (raw !== stored || !isFileName(name)) {
       rejectDamaged(`section '${type}' refers to no file of its folder`);
     }
     return { type, name, checksum: new DataView(data.buffer, data.byteOffset).getUint32(0, true) };

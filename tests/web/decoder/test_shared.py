@@ -17,6 +17,7 @@ from hyrfpack.format import describe_file, load_model
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.container import MINOR_VERSION, Section, read_container, write_container
 from hyrfpack.format.shared import CODEC_SHARED
+from tools.safety import minimal_reader
 from tools.safety.fuzz_browser import read_in_javascript
 from tools.safety.make_golden import GOLDEN_SCENE_FOLDER
 
@@ -73,6 +74,19 @@ def test_a_chunk_has_the_bits_and_the_provenance_that_python_reads(tmp_path: Pat
         assert answer["count"] == len(model) and answer["opened"] == [SHARED_FILE_NAME]
         assert answer["hashes"] == [hashlib.sha256(arrays[tag].tobytes()).hexdigest() for tag in SECTION_TAGS]
         assert answer["hasMap"] and answer["provenance"] == describe_file(path)["provenance"]
+
+
+def test_unknown_sections_with_the_codec_of_references_are_skipped(tmp_path: Path):
+    chunk, shared = ((GOLDEN_SCENE_FOLDER / name).read_bytes() for name in (CHUNK_FILE_NAME, SHARED_FILE_NAME))
+    sections = read_container(chunk).sections
+    unknown = [Section(tag, CODEC_SHARED, b"any bytes", 9, required=False) for tag in ("ABCD", "POS5")]
+    paths = make_folders(tmp_path, [chunk, write_container([*sections, *unknown], MINOR_VERSION)], [shared, shared])
+
+    known, extended = run_script(READ_CHUNKS_SCRIPT, *paths)
+
+    assert known == extended and known["hashes"]
+    assert len(load_model(paths[1])) == known["count"]
+    minimal_reader.read(paths[1].read_bytes(), folder={SHARED_FILE_NAME: shared})
 
 
 def test_references_that_python_refuses_are_refused(tmp_path: Path):
