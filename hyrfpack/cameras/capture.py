@@ -66,8 +66,9 @@ def scene_provenance(scene: Scene) -> dict:
     """
     cameras = [view.camera for view in scene.train]
     points = scene.points
-    unit = float(np.std(points)) / 100 if len(points) else 1.0  # so small that the near plane hides nothing
-    stored, ratio = select_representative_cameras(cameras, points, unit, MAX_STORED_CAMERAS, MAX_STORED_CAMERAS)
+    # The unit is so small that the near plane hides nothing, wherever the origin lies.
+    unit = float(np.std(points, axis=0).max(initial=0)) / 100 if len(points) else 0.0
+    stored, ratio = select_representative_cameras(cameras, points, unit or 1.0, MAX_STORED_CAMERAS, MAX_STORED_CAMERAS)
     provenance: dict = {"viewpoint": Viewpoint.from_cameras(cameras).to_json(), "cameras": provenance_cameras(stored)}
     if ratio > 1:
         provenance[RATE_RATIO_KEY] = _rounded_ratio(ratio)
@@ -86,7 +87,7 @@ def quantized_provenance(provenance: dict, scale: float, points: np.ndarray | No
 
     MIN_COARSE_CAMERAS are kept, and more where these show the scene less finely than all of them. Their positions are
     rounded to about scale / COARSE_POSE_STEPS_PER_SCENE_SCALE, which is precise enough to render from there, but not to
-    train. Entries that cannot be read are left out.
+    train. Cameras that cannot be read are left out, and a viewpoint that cannot be read stays as it is.
 
     Args:
         provenance: the provenance of a trained model.

@@ -14,7 +14,7 @@ import numpy as np
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera, rigid_pose
 
-MAX_IMAGE_SIDE_PIXELS = 16384  # a larger number in a file is treated as a mistake
+MAX_IMAGE_SIDE_PIXELS = 16384  # a larger number in a file is treated as a mistake, and larger photos are refused
 INTRINSICS_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 _FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 
@@ -198,7 +198,7 @@ def _finite_float(value: Any) -> float:
 def _side_length(value: Any) -> int:
     """Check that a side of a picture is a whole number of pixels that can be rendered."""
     if value != int(value) or not 1 <= value <= MAX_IMAGE_SIDE_PIXELS:
-        raise ValueError(f"a side of {value} pixels; 1 to {MAX_IMAGE_SIDE_PIXELS} can be rendered")
+        raise ValueError(f"a side of {value} pixels; 1 to {MAX_IMAGE_SIDE_PIXELS} are allowed")
     return int(value)
 
 

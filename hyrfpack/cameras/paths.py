@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from hyrfpack.cameras.files import INTRINSICS_KEYS, camera_from_json, check_json_numbers, round_number
+from hyrfpack.cameras.placement import unit_vector
 from hyrfpack.rotations import IDENTITY, rotation_matrix
 from hyrfpack.scene import Camera
 
@@ -205,7 +206,7 @@ def orbit(viewpoint: Viewpoint, frames: int) -> list[Camera]:
     offset = camera.position - center
     radius = np.linalg.norm(offset - (offset @ up) * up)
     if not radius > 1e-9 * np.linalg.norm(offset):  # straight above the centre, where the circle would be a point
-        offset = offset + 0.5 * max(float(np.linalg.norm(offset)), 1e-6) * _perpendicular(up)
+        offset = offset + 0.5 * (float(np.linalg.norm(offset)) or 1.0) * _perpendicular(up)
     turns = np.arange(frames) / frames
     if last - first >= 360:
         angles = first + (last - first) * turns
@@ -219,7 +220,8 @@ def orbit(viewpoint: Viewpoint, frames: int) -> list[Camera]:
 
 def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Return the (4, 4) camera_from_world of a camera at `position` that looks at `target`; `up` is a unit vector."""
-    forward = _unit(target - position, np.array([0.0, 0.0, 1.0]))
+    offset = target - position  # of any length: the world's unit may be a millimetre or a light year
+    forward = unit_vector(offset) if offset.any() else np.array([0.0, 0.0, 1.0])
     right = np.cross(forward, up)
     right = _unit(right, _perpendicular(forward)) if np.linalg.norm(right) > 1e-9 else _perpendicular(forward)
     pose = np.eye(4)

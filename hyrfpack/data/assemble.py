@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from hyrfpack.cameras.files import MAX_IMAGE_SIDE_PIXELS
 from hyrfpack.counts import format_count
 from hyrfpack.data.equirectangular import CUBE_FACES, Face, FaceFile, face_lens, face_size
 from hyrfpack.data.folder import is_raw_name, list_pictures
@@ -344,6 +345,12 @@ def _make_view(photo: PosedPhoto, max_size: int) -> View:
             fix="use the pictures that were calibrated (unrotated)",
         )
     size = fit_size(*header.size, max_size)
+    if max(size) > MAX_IMAGE_SIDE_PIXELS:
+        raise HyrfDataError(
+            f"{photo.path}: {size[0]:,} x {size[1]:,} pixels; the cameras of a model may have up to "
+            f"{MAX_IMAGE_SIDE_PIXELS:,} on a side",
+            fix=f"shrink the photos with `max_size`, to {MAX_IMAGE_SIDE_PIXELS} or less",
+        )
     if size != (lens.width, lens.height):
         lens = lens.scaled(*size)
     pose = _orthonormal_pose(photo.camera_from_world, photo.path)

@@ -15,10 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from hyrfpack.errors import HyrfDataError
-from hyrfpack.ops.transfer import tensor_like
 from hyrfpack.ops.viewport import Viewport
 from hyrfpack.rotations import IDENTITY, Quaternion, check_rotation, rotation_matrix
 from hyrfpack.scene import Camera
@@ -102,7 +100,3 @@ class Frame:
         """Return the camera in local units, with its pose in `dtype` on the CPU."""
         pose = torch.as_tensor(self.local_pose(camera), dtype=dtype)
         return Viewport(pose, camera.intrinsics, camera.width, camera.height)
-
-    def normalize(self, local: Tensor) -> Tensor:
-        """Convert local positions (..., 3) to u = local / half_extent, where the box is [-1, 1]^3."""
-        return local / tensor_like(self.half_extent, local)

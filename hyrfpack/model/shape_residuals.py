@@ -7,6 +7,8 @@ import itertools
 import torch
 from torch import Tensor
 
+from hyrfpack.ops.rasterize.reference import quats_to_rotations
+
 
 def compute_shape_residuals(raw: Tensor, scale_logits: Tensor, quats: Tensor) -> tuple[Tensor, Tensor]:
     """Return the shape residuals (N, 5) and explicit scale logits (N, 1) that give Gaussians their shapes.
@@ -28,7 +30,7 @@ def compute_shape_residuals(raw: Tensor, scale_logits: Tensor, quats: Tensor) ->
     turned = _multiply(difference, exchanges[nearest])
     cosine = turned[:, :1]
     rotation = turned[:, 1:] / torch.where(cosine == 0, 1, cosine)  # it is 0 only if the field predicts no rotation
-    order = _axis_orders(exchanges)[nearest]
+    order = quats_to_rotations(exchanges).abs().argmax(dim=1)[nearest]  # the old axis along each new one
     logits = scale_logits.gather(1, order) - raw[:, 1:4]
     mean = logits.mean(dim=1, keepdim=True)
     return torch.cat(((logits - mean)[:, :2], rotation), dim=1), mean
@@ -61,14 +63,3 @@ def _axis_exchanges() -> Tensor:
             quat[first], quat[second] = 1, sign
             quats.append(tuple(quat))
     return torch.nn.functional.normalize(torch.tensor(quats, dtype=torch.float64), dim=1)
-
-
-def _axis_orders(quats: Tensor) -> Tensor:
-    """Return, for each of the rotations (24, 4), the old axis (24, 3) int64 that each new axis lies along."""
-    w, x, y, z = quats.unbind(1)
-    columns = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(column, dim=1).abs().argmax(dim=1) for column in columns], dim=1)

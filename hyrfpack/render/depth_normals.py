@@ -65,9 +65,11 @@ def _fit_planes(padded: Tensor, first: int, last: int, step: int, camera: Camera
         top = margin + first + y * step
         for x in offsets:
             left = margin + x * step
-            change = padded[top : top + height, left : left + width] - inverse
+            other = padded[top : top + height, left : left + width]
+            change = other - inverse
             slope_limit = MAX_SLOPE * step * math.hypot(x / camera.fx, y / camera.fy)
-            counts = change.abs() < (MAX_INVERSE_DEPTH_CHANGE + slope_limit) * inverse
+            # A sample without depth or outside the picture is no surface at infinity, however large the slope limit is.
+            counts = (other > 0) & (change.abs() < (MAX_INVERSE_DEPTH_CHANGE + slope_limit) * inverse)
             change = torch.where(counts, change, 0)
             for index, factor in enumerate((x * x, x * y, y * y, x, y, 1)):
                 if factor:

@@ -30,7 +30,8 @@ def write_video(
     """Encode PNG files as an MP4 video, which is written completely or not at all.
 
     Args:
-        frames: PNG files in order; those of another size than the first are fitted into its size, between black bars.
+        frames: PNG files in order, at least one; those of another size than the first are fitted into its size, between
+            black bars.
         path: the .mp4 file to write, in an existing folder.
         frames_per_second: frame rate of the video.
         overwrite: replace a file at `path`; without it, a free file name in the same folder is used.
@@ -39,8 +40,10 @@ def write_video(
         The path that was written.
 
     Raises:
-        HyrfError: there is no ffmpeg program, or it fails; the message contains its last line.
+        HyrfError: there is no frame or no ffmpeg program, or the program fails; the message contains its last line.
     """
+    if not frames:
+        raise HyrfError(f"{path}: there are no frames to make a video of", fix="render at least one")
     program = shutil.which("ffmpeg")
     if program is None:
         raise HyrfError(

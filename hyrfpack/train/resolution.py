@@ -14,6 +14,7 @@ from statistics import fmean
 
 import numpy as np
 
+from hyrfpack.cameras.sampling import MAX_BACKGROUND_STRIDE
 from hyrfpack.choices import CONSISTENT_EXPOSURE
 from hyrfpack.config.train import DensityConfig
 from hyrfpack.data.cache import DEFAULT_PREFETCHED_PICTURES
@@ -186,4 +187,5 @@ def reduced_low_pass_variance(factor: int) -> float:
 
 def background_stride(camera: Camera) -> int:
     """Return the stride at which the last training steps evaluate the background."""
-    return max(MIN_BACKGROUND_STRIDE, math.ceil(math.sqrt(camera.width * camera.height / MAX_BACKGROUND_NODES)))
+    stride = math.ceil(math.sqrt(camera.width * camera.height / MAX_BACKGROUND_NODES))
+    return min(max(MIN_BACKGROUND_STRIDE, stride), MAX_BACKGROUND_STRIDE)

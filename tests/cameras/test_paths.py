@@ -81,6 +81,13 @@ def test_orbit_around_a_place_seen_from_straight_above_is_a_circle():
     assert np.ptp(positions, axis=0)[:2].min() > 1
 
 
+@pytest.mark.parametrize("scale", [1e-30, 1e-13, 1.0, 1e20])
+def test_an_orbit_looks_at_the_centre_of_a_scene_of_any_unit(scale):
+    for camera in orbit(Viewpoint.from_frame((0.0, 0.0, 0.0), scale), 4):
+        direction = -camera.position / np.abs(camera.position).max()
+        assert camera.forward @ direction == pytest.approx(np.linalg.norm(direction))
+
+
 def test_look_at_accepts_a_viewing_direction_along_up():
     pose = look_at(np.array([0.0, 0.0, 2.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)

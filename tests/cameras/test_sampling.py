@@ -3,13 +3,14 @@
 import json
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import ball_scene, camera_at, ring
+from scenes import ball_scene, camera_at, ring, shift_cameras
 from scipy.spatial.transform import Rotation
 
 from hyrfpack.cameras.capture import MIN_COARSE_CAMERAS, provenance_cameras, quantized_provenance, scene_provenance
@@ -201,8 +202,8 @@ def walk_through(count: int) -> tuple[list[Camera], np.ndarray]:
     return cameras, np.stack(wall, axis=1)
 
 
-def sizes_of(photos: PhotoCameras, points: np.ndarray) -> np.ndarray:
-    sizes = photos.pixel_sizes(points.astype(np.float32), (0, 0, 0), 1.0)
+def sizes_of(photos: PhotoCameras, points: np.ndarray, center: Sequence[float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    sizes = photos.pixel_sizes((points - center).astype(np.float32), center, 1.0)
     assert sizes is not None
     return sizes
 
@@ -216,11 +217,13 @@ def test_files_of_long_walks_keep_more_cameras():
     assert quantized_provenance(kept, 1.0, points) == kept
 
 
-def test_where_no_allowed_number_of_cameras_represents_all_photos_their_rate_ratio_is_kept():
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (5e5, 5.4e6, 100.0)], ids=["near", "map coordinates"])
+def test_where_no_allowed_number_of_cameras_represents_all_photos_their_rate_ratio_is_kept(origin):
     cameras, points = walk_through(1000)
+    cameras, points = shift_cameras(cameras, np.array(origin)), points + origin
     views = [replace(view, camera=camera) for view, camera in zip(ball_scene(1).train * 1000, cameras, strict=True)]
     scene = replace(ball_scene(1), train=views, test=[], points=points)
-    every = sizes_of(PhotoCameras(cameras, 1.0, 2), points)
+    every = sizes_of(PhotoCameras(cameras, 1.0, 2), points, origin)
 
     raw = json.loads(json.dumps(scene_provenance(scene)))
     packed = json.loads(json.dumps(quantized_provenance(raw, 1.0, points)))
@@ -228,4 +231,4 @@ def test_where_no_allowed_number_of_cameras_represents_all_photos_their_rate_rat
     for kept in (raw, packed):
         photos = PhotoCameras.from_provenance(kept)
         assert len(photos.cameras) <= MAX_SAMPLING_CAMERAS and photos.rate_ratio > MAX_REPRESENTED_RATIO
-        assert (sizes_of(photos, points) <= 1.01 * every).mean() >= REPRESENTED_SHARE - 0.02
+        assert (sizes_of(photos, points, origin) <= 1.01 * every).mean() >= REPRESENTED_SHARE - 0.02

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hyrfpack.data import load_scene
+from hyrfpack.data import assemble, load_scene
 from hyrfpack.data.pictures import fit_size, read_mask, read_pixels
 from hyrfpack.errors import HyrfDataError, HyrfError
 
@@ -44,6 +44,18 @@ def test_intrinsics_are_scaled_exactly_with_the_photos(tmp_path, colmap_folder):
     expected = (30 * 21 / 32, 31 * 16 / 24, 17 * 21 / 32, 11 * 16 / 24)
     np.testing.assert_allclose(uneven.camera.intrinsics, expected, rtol=1e-15)
     assert uneven.load().rgb.shape == (16, 21, 3)
+
+
+def test_photos_larger_than_a_stored_camera_may_be_are_refused_unless_they_are_shrunk(
+    tmp_path, colmap_folder, monkeypatch
+):
+    """Otherwise the cameras of the model would be written, but not read."""
+    colmap_folder(tmp_path, count=3)
+    monkeypatch.setattr(assemble, "MAX_IMAGE_SIDE_PIXELS", 31)
+
+    with pytest.raises(HyrfDataError, match="32 x 24 pixels; the cameras.*up to 31 on a side; shrink.*to 31 or less"):
+        load_scene(tmp_path)
+    assert load_scene(tmp_path, max_size=31).views[0].camera.width == 31
 
 
 def test_intrinsics_calibrated_at_another_size_are_scaled_too(tmp_path, colmap_folder, pictures):

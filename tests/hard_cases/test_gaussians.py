@@ -440,6 +440,27 @@ def test_a_centre_farther_off_axis_than_an_integer_of_pixels_is_not_drawn(
 
 
 @pytest.mark.parametrize("implementation", ["cpu", "reference"])
+def test_a_disc_whose_border_only_float32_puts_into_the_picture_hides_no_other(implementation: str) -> None:
+    """Its pairs of tiles may not take the place of those of another Gaussian of the same chunk."""
+    far = ((-8792.4365, 0.0, 0.02), (2666.4785, 2666.4785, 1e-6), IDENTITY_QUATERNION, 0.9)
+    small = ((0.35, 0.35, 1.0), (0.003, 0.003, 0.003), IDENTITY_QUATERNION, 0.9)
+    gaussians = _make_gaussians(far, small)
+    viewport = Viewport(IDENTITY_POSE, (100.0, 100.0, 50.0, 50.0), 100, 100)
+    options = {name: gaussians[name] for name in PARAMETER_NAMES[:-1]}
+
+    pictures = [
+        rasterize(Gaussians3D(**values), colors, viewport, implementation=kind)
+        for values, colors, kind in (
+            (options, gaussians["colors"], implementation),
+            ({name: part.double() for name, part in options.items()}, gaussians["colors"].double(), "reference"),
+        )
+    ]
+
+    assert pictures[0].visible[1] and pictures[1].rgb.max() > 0.1
+    np.testing.assert_allclose(pictures[0].rgb, pictures[1].rgb, atol=1e-5)
+
+
+@pytest.mark.parametrize("implementation", ["cpu", "reference"])
 def test_a_centre_one_step_beyond_the_near_plane_is_drawn(implementation: str) -> None:
     depth = float(np.nextafter(np.float32(0.25), np.float32(1)))
     case = Case(_make_between_ordinary(((0.0, 0.0, depth), (5.0, 5.0, 5.0), IDENTITY_QUATERNION, 0.9)), {"near": 0.25})

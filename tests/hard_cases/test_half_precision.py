@@ -113,7 +113,9 @@ def test_far_points_move_less_than_2_to_the_minus_12_in_the_contracted_cube(log_
     directions = np.random.default_rng(seed).normal(size=(50, 3))
     local = 10.0**log_radius * directions / np.linalg.norm(directions, axis=1, keepdims=True) * half
 
-    cubes = [contract(frame.normalize(torch.from_numpy(points))) for points in (local, decode_positions(local, frame))]
+    cubes = [
+        contract(torch.from_numpy(points), frame.half_extent) for points in (local, decode_positions(local, frame))
+    ]
 
     assert torch.linalg.vector_norm(cubes[1] - cubes[0], dim=-1).max() <= 2.0**-12 * (1 + 2.0**-10)
 

@@ -135,6 +135,11 @@ def test_videos_show_the_colours_of_their_pictures(tmp_path):
 def test_a_video_without_ffmpeg_is_a_clear_error(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(HyrfError, match="no ffmpeg program"):
+        write_video([tmp_path / "frame.png"], tmp_path / "video.mp4")
+
+
+def test_a_video_without_frames_is_a_clear_error(tmp_path):
+    with pytest.raises(HyrfError, match="there are no frames to make a video of; render at least one"):
         write_video([], tmp_path / "video.mp4")
 
 

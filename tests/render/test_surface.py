@@ -59,6 +59,17 @@ def test_the_normals_of_a_plane_are_exact_up_to_the_border(tilt_x, tilt_y, dista
     assert is_slanted.mean() < 0.7 and np.abs(found + normal)[~is_slanted].max() < 1e-4
 
 
+@pytest.mark.parametrize("side", [3, 16, 24, 32])
+def test_the_normals_of_a_plane_in_a_small_picture_are_exact(side):
+    """There the slope limit is so large that it would let samples without depth count."""
+    camera, normal = Camera(side, side, side / 2, side / 2, side / 2, side / 2, np.eye(4)), np.array([-0.3, 0, 1.0])
+    normal /= np.linalg.norm(normal)
+
+    found = normals_from_depth(torch.from_numpy(plane_depth(camera, normal, 2.0)), camera).numpy()
+
+    assert np.abs(found + normal).max() < 1e-4
+
+
 def test_the_normals_of_a_sphere_are_those_of_its_surface():
     camera = Camera(160, 120, 140.0, 140.0, 80.0, 60.0, np.eye(4))
     rays = rays_of(camera)

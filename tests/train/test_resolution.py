@@ -5,6 +5,7 @@ import pytest
 import torch
 from scenes import ball_points, small_model
 
+from hyrfpack.cameras.sampling import MAX_BACKGROUND_STRIDE
 from hyrfpack.config.train import DensityConfig, TrainConfig
 from hyrfpack.data.cache import DEFAULT_PREFETCHED_PICTURES
 from hyrfpack.data.reduced import reduce_camera
@@ -155,6 +156,10 @@ def test_large_steps_evaluate_the_background_at_few_pixels() -> None:
         stride = background_stride(make_view(width, height).camera)
         assert width * height / stride**2 <= resolution.MAX_BACKGROUND_NODES < width * height / (stride - 1) ** 2
     assert background_stride(make_view(400, 266).camera) == resolution.MIN_BACKGROUND_STRIDE
+
+
+def test_the_largest_photos_are_rendered_with_an_allowed_stride() -> None:
+    assert background_stride(make_view(16384, 16384).camera) == MAX_BACKGROUND_STRIDE
 
 
 @pytest.mark.parametrize(("is_on", "coarse"), [(True, resolution.COARSE_BACKGROUND_STRIDE), (False, 2)])

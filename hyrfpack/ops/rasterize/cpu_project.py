@@ -35,6 +35,8 @@ GRADIENT_ROW_FLOATS = 16
 HIDDEN_KEY = np.uint32(0xFFFFFFFF)
 # Gaussians with a larger depth, opacity, covariance or mean are not drawn.
 _MAX_MAGNITUDE = 1e30
+# The bound of a Gaussian's tiles is widened by an absolute margin and by one relative to the size of the coordinates.
+_SPAN_MARGIN_PIXELS, _SPAN_MARGIN_RATIO = 0.01, 1e-6
 _COMPILE_OPTIONS = {"fastmath": {"contract", "nsz"}, "error_model": "numpy"}
 _kernel = compiled(**_COMPILE_OPTIONS)
 _inlined = compiled(**_COMPILE_OPTIONS, inline="always")  # LLVM does not inline functions of this size by itself.
@@ -212,7 +214,10 @@ def project(start, stop, gaussians, settings, projection):
 
         cut = 2 * math.log(255 * opacity)
         reach = cut + 1e-3
-        extent_x, extent_y = math.sqrt(reach * xx) + 0.01, math.sqrt(reach * yy) + 0.01
+        extent_x, extent_y = math.sqrt(reach * xx), math.sqrt(reach * yy)
+        # Pairs are found with records in float32, which may lie a little farther out.
+        extent_x += _SPAN_MARGIN_PIXELS + _SPAN_MARGIN_RATIO * (abs(mean_x) + extent_x)
+        extent_y += _SPAN_MARGIN_PIXELS + _SPAN_MARGIN_RATIO * (abs(mean_y) + extent_y)
         left, right = mean_x - extent_x - 0.5, mean_x + extent_x - 0.5
         top, bottom = mean_y - extent_y - 0.5, mean_y + extent_y - 0.5
         # Bounds beyond the picture are compared as floats, because they may exceed every integer.

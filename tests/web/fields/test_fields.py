@@ -64,7 +64,7 @@ def evaluate_in_float64(
         colors = torch.sigmoid(model.radiance(coords, encode_directions(along, coding)) + model.gaussians.color_logits)
         if model.gaussians.color_residuals is not None:
             colors = add_color_residuals(colors, model.gaussians.color_residuals, along)
-        sphere = contract(model.config.frame.normalize(places))
+        sphere = contract(places, model.config.frame.half_extent)
         background = torch.sigmoid(model.radiance(sphere, encode_directions(behind, coding)))
     quats = geometry.quats / geometry.quats.norm(dim=1, keepdim=True)
     return [part.numpy() for part in (geometry.opacities, geometry.scales, quats, colors, background)]
