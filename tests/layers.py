@@ -14,14 +14,16 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from collections.abc import Container, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from unittest.mock import patch
 
 import pytest
+
+from hyrfpack.train.trainer import Trainer
 
 LAYERS = ("unit", "integration", "acceptance")
 BROWSER_FIXTURES = {"browser", "browser_reader", "one_browser", "start_browser"}
@@ -105,6 +107,6 @@ def forbid_training_and_processes() -> Iterator[None]:
             stack.enter_context(patch.object(subprocess.Popen, "__init__", refuse))
         if hasattr(os, "fork"):
             stack.enter_context(patch.object(os, "fork", refuse))
-        if "hyrfpack.train.trainer" in sys.modules:
-            stack.enter_context(patch.object(sys.modules["hyrfpack.train.trainer"].Trainer, "run", refuse))
+        stack.enter_context(patch.object(BaseProcess, "start", refuse))
+        stack.enter_context(patch.object(Trainer, "run", refuse))
         yield

@@ -1,8 +1,21 @@
 import csv
+import json
+from dataclasses import asdict, replace
 
 import pytest
 
-from tools.studies.count_laws import SURVEY_COLUMNS, CountRow, format_fits, format_rows, write_survey
+from tools.studies import reuse
+from tools.studies.count_laws import (
+    ROW_FILE,
+    SURVEY_COLUMNS,
+    CountRow,
+    describe_run,
+    format_fits,
+    format_rows,
+    has_row,
+    read_rows,
+    write_survey,
+)
 
 
 def row(size: int, gaussians: int, psnr: float, total: int, lpips: float | None = None) -> CountRow:
@@ -42,3 +55,25 @@ def test_the_survey_gets_one_file_for_each_photo_size_with_its_columns(tmp_path)
 def test_the_survey_of_one_photo_size_has_the_name_of_the_set(tmp_path):
     write_survey(ROWS_ON_A_LAW, tmp_path, "bonsai")
     assert [path.name for path in tmp_path.iterdir()] == ["bonsai.csv"]
+
+
+def test_rows_of_another_version_are_named_and_left_out(tmp_path, monkeypatch, capsys):
+    for version, counts in (("old", (1000, 2000)), ("new", (4000,))):
+        monkeypatch.setattr(reuse, "describe_own_version", lambda version=version: version)
+        for count in counts:
+            folder = tmp_path / "400" / str(count)
+            folder.mkdir(parents=True)
+            (folder / ROW_FILE).write_text(json.dumps(asdict(row(400, count, 20.0, 10_000))))
+            reuse.write_origin(folder, describe_run(tmp_path / "data", 3000, 400, count))
+
+    assert [kept.gaussians for kept in read_rows(tmp_path, tmp_path / "data", 3000)] == [4000]
+    assert capsys.readouterr().err.count("is left out: version was old, now new") == 2
+
+
+def test_a_row_with_other_weights_of_lpips_is_measured_again(tmp_path):
+    weights = tmp_path / "alex.pth"
+    measured = replace(row(400, 1000, 20.0, 10_000, 0.25), lpips_weights=str(weights.resolve()))
+    (tmp_path / ROW_FILE).write_text(json.dumps(asdict(measured)))
+
+    assert has_row(tmp_path, None) and has_row(tmp_path, weights)
+    assert not has_row(tmp_path, tmp_path / "vgg.pth")

@@ -64,7 +64,7 @@ def test_a_stopped_run_resumes_from_its_checkpoint(run_tool, monkeypatch):
         return train(scene, folder, config, context=QUIET_CONTEXT)
 
     monkeypatch.setattr(long_runs.hyrfpack, "train_model", stop_once)
-    with pytest.raises(SystemExit, match="resumes"):
+    with pytest.raises(SystemExit, match="the training was stopped, so it is not measured"):
         run_tool()
     run_tool()
     assert resumed == [False, True, False]

@@ -59,6 +59,11 @@ def test_scores_are_compared_at_the_most_bytes_that_both_have():
     assert score_gain_at_equal_bytes(make_curve(4 * FILE_SIZES, -0.2), make_curve(FILE_SIZES)) == pytest.approx(-0.2)
 
 
+def test_scores_of_files_of_other_sizes_are_not_compared():
+    smaller, larger = np.array([[8e4, 30.0], [9e4, 31.0]]), np.array([[1e5, 30.4]])
+    assert score_gain_at_equal_bytes(smaller, larger) is score_gain_at_equal_bytes(larger, smaller) is None
+
+
 @pytest.fixture
 def scored_commands(monkeypatch, tmp_path):
     """The commands that `train_and_score` runs, of which none is executed."""

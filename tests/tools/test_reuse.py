@@ -10,7 +10,7 @@ import pytest
 
 import hyrfpack
 from hyrfpack.errors import HyrfError
-from hyrfpack.train import TrainConfig
+from hyrfpack.train import TrainConfig, TrainResult
 from tools.studies import magnification, precision, processes, reuse, train_sets
 from tools.studies.reuse import check_origin, describe_origin, describe_version, remove_outdated, write_origin
 
@@ -77,14 +77,14 @@ def test_a_folder_that_is_no_work_tree_has_no_version(tmp_path: Path, monkeypatc
 def test_without_git_a_version_is_a_digest_of_the_sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
     monkeypatch.setattr(reuse, "REPOSITORY_ROOT", tmp_path)
-    (tmp_path / "hyrfpack").mkdir()
     names = []
-    for text in ("a = 1", "a = 2"):
-        (tmp_path / "hyrfpack" / "code.py").write_text(text)
+    for folder, text in (("hyrfpack", "a = 1"), ("hyrfpack", "a = 2"), ("tools", "a = 1"), ("tools", "a = 2")):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / "code.py").write_text(text)
         reuse.describe_own_version.cache_clear()
         names.append(reuse.describe_own_version())
     reuse.describe_own_version.cache_clear()
-    assert len(set(names)) == 2 and all(name.startswith("sources-") for name in names)
+    assert len(set(names)) == 4 and all(name.startswith("sources-") for name in names)
 
 
 @pytest.mark.parametrize(
@@ -140,6 +140,7 @@ def fake_training(monkeypatch):
         out.mkdir(parents=True, exist_ok=True)
         for name in files:
             (out / name).write_text(metrics)
+        return TrainResult(True, 5, out / "model.hyrf", {})
 
     model = SimpleNamespace(gaussians=SimpleNamespace())
     scene = SimpleNamespace(views=[SimpleNamespace(camera=SimpleNamespace(width=8, height=8))], test=[])
@@ -157,6 +158,21 @@ def fake_training(monkeypatch):
 
     monkeypatch.setattr(processes.subprocess, "run", run)
     return trained
+
+
+def test_an_interrupted_run_is_not_measured_as_one_of_this_version(fake_training, set_version, tmp_path, monkeypatch):
+    """Its folder still has the metrics of the run that it would have replaced."""
+
+    def measure(*, reuse: bool) -> None:
+        train_sets.measure(tmp_path / "data", "demo", tmp_path / "out", TrainConfig(), reuse=reuse)
+
+    measure(reuse=False)
+    set_version("second")
+    monkeypatch.setattr(hyrfpack, "train_model", lambda *arguments, **options: TrainResult(False, 1, None, {}))
+    with pytest.raises(SystemExit, match="the training was stopped, so it is not measured"):
+        measure(reuse=False)
+    with pytest.raises(HyrfError, match="not one of the same version"):
+        measure(reuse=True)
 
 
 def test_a_reused_run_of_a_data_set_is_refused_for_another_version_or_other_settings(

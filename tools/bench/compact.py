@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from unittest import mock
 
@@ -27,6 +28,8 @@ from hyrfpack.model.gaussians import Gaussians
 from hyrfpack.parallel import has_numba
 from tools.safety.synthetic_encoding import draw_sensitivity
 
+# The modules that choose between Numba's kernels and others.
+NUMBA_USERS = ("hyrfpack.quant.rans", "hyrfpack.ops.dispatch")
 # Number of Gaussians and log2_table_size of the radiance grid; the geometry grid's table is half as large.
 MODEL_SIZES = ((100_000, 14), (1_000_000, 17))
 TIMING_REPEATS = 3
@@ -108,7 +111,9 @@ def _with_numba(use_numba: bool, task: Callable[[], object]) -> Callable[[], obj
     """Return the task with Numba's kernels enabled, or disabled as on machines without Numba."""
 
     def run() -> object:
-        with mock.patch("hyrfpack.quant.rans.has_numba", lambda: use_numba):
+        with ExitStack() as stack:
+            for module in NUMBA_USERS:
+                stack.enter_context(mock.patch(f"{module}.has_numba", lambda: use_numba))
             return task()
 
     return run

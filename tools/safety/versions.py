@@ -5,9 +5,10 @@
 
 `make test` uses the versions of constraints.txt, but users have other versions. "newest" installs the newest versions
 that pip would choose, "oldest" the lower bounds of pyproject.toml. Each run has its own environment in .versions/ (6 GB
-with torch's GPU build), where the package is installed, not linked. Arguments after `--` go to pytest. The log of a run
-is beside its environment. It prints one line for each Python with pytest's result and the seconds, and exits with 1
-after a failure.
+with torch's GPU build), where the package is installed with its dependencies. As in `make test`, the tests import the
+package of this repository; `tests/test_package.py` checks what an installed one contains. Arguments after `--` go to
+pytest. The log of a run is beside its environment. It prints one line for each Python with pytest's result and the
+seconds, and exits with 1 after a failure.
 """
 
 from __future__ import annotations

@@ -249,6 +249,7 @@ def _replace_model(model: HybridModel, kind: type[HybridModel], seed: int) -> Hy
         model.gaussians.color_logits.add_(start)
     replaced = kind(model.config, model.gaussians, torch.Generator().manual_seed(seed))
     replaced.radiance.biases[-1][: len(start)] = start
+    replaced.copy_settings(model)
     return replaced
 
 

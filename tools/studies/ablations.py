@@ -79,7 +79,9 @@ def train_and_measure(
         getattr(trainer.model.gaussians, name).requires_grad_(False)  # its size does not include them
     if variant is FULL_VARIANT:
         save_model(trainer.model, full_path)
-    result = measure(variant, trainer.model, load_model(full_path), scene)
+    full = load_model(full_path)
+    full.copy_settings(trainer.model)  # The file has no cameras, so both would draw the background at other places.
+    result = measure(variant, trainer.model, full, scene)
     return {**result, "steps_per_second": config.steps / trainer.elapsed, "seconds": trainer.elapsed}
 
 

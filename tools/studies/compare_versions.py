@@ -162,13 +162,19 @@ def bytes_change_at_equal_psnr(ours: np.ndarray, theirs: np.ndarray) -> float | 
     return float(np.exp(log_bytes[0] - log_bytes[1]) - 1)
 
 
-def score_gain_at_equal_bytes(ours: np.ndarray, theirs: np.ndarray) -> float:
+def score_gain_at_equal_bytes(ours: np.ndarray, theirs: np.ndarray) -> float | None:
     """Return the score of `ours` minus that of `theirs` at the largest number of bytes that both reach.
 
     Args:
         ours, theirs: (n, 2) bytes and score at n sizes.
+
+    Returns:
+        The difference; None if all files of one are larger than those of the other.
     """
-    size = np.log(min(points[:, 0].max() for points in (ours, theirs)))
+    largest = min(points[:, 0].max() for points in (ours, theirs))
+    if largest < max(points[:, 0].min() for points in (ours, theirs)):
+        return None
+    size = np.log(largest)
     values = []
     for points in (ours, theirs):
         rising = points[np.argsort(points[:, 0])]
@@ -185,7 +191,9 @@ def format_row(name: str, ours: list[dict[str, float]], theirs: list[dict[str, f
 
     saved = bytes_change_at_equal_psnr(*pair("psnr"))
     cells = [name, "" if saved is None else f"{100 * saved:+.0f} %"]
-    cells += [f"{score_gain_at_equal_bytes(*pair(score)):+.{digits}f}" for score, digits in _SCORE_DIGITS.items()]
+    for score, digits in _SCORE_DIGITS.items():
+        gain = score_gain_at_equal_bytes(*pair(score))
+        cells.append("" if gain is None else f"{gain:+.{digits}f}")
     cells.append(f"{np.sum(curves[0]['seconds']) / np.sum(curves[1]['seconds']):.2f}")
     for curve in curves[::-1]:
         points = zip(curve["bytes"], curve["psnr"], strict=True)

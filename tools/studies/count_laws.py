@@ -21,8 +21,9 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,8 @@ from hyrfpack.format.sections import LOGIT_SECTIONS, POSITIONS, TABLE_SECTIONS
 from hyrfpack.train import TrainConfig
 from tools.command import positive_integer, run_command
 from tools.json_files import write_json
-from tools.studies.reuse import describe_origin, remove_outdated
+from tools.studies.complete_run import train_completely
+from tools.studies.reuse import Origin, describe_origin, find_differences, remove_outdated
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_table
 
@@ -64,6 +66,7 @@ class CountRow:
     properties: int
     tables: int
     rest: int
+    lpips_weights: str | None = None
 
 
 def measure(data: Path, size: int, count: int, steps: int, folder: Path, lpips_weights: Path | None) -> CountRow:
@@ -74,7 +77,7 @@ def measure(data: Path, size: int, count: int, steps: int, folder: Path, lpips_w
     scene, quiet = hyrfpack.load_scene(data, max_size=size), hyrfpack.RunContext(progress=None)
     if not (folder / METRICS_FILE).exists():
         config = TrainConfig(steps=steps, max_gaussians=count, exposure=False)
-        hyrfpack.train_model(scene, folder, config, overwrite=True, context=quiet)
+        train_completely(scene, folder, config, context=quiet)
     path = folder / "compact.hyrf"
     report = hyrfpack.compress_model(folder / MODEL_FILE, path, context=quiet)
     scores = hyrfpack.evaluate_model(hyrfpack.load_model(path), scene.test, lpips_weights=lpips_weights)
@@ -87,19 +90,36 @@ def measure(data: Path, size: int, count: int, steps: int, folder: Path, lpips_w
     total = report.bytes_after
     rest = total - sum(parts.values())
     row = CountRow(size, report.gaussians, total, scores.psnr, scores.ssim, scores.lpips, **parts, rest=rest)
+    row = replace(row, lpips_weights=None if lpips_weights is None else str(lpips_weights.resolve()))
     write_json(folder / ROW_FILE, asdict(row))
     return row
 
 
-def has_row(folder: Path, needs_lpips: bool) -> bool:
-    """Return whether a run has been measured, and with LPIPS if that is needed."""
+def has_row(folder: Path, lpips_weights: Path | None) -> bool:
+    """Return whether a run has been measured, and with these weights of LPIPS if there are any."""
     path = folder / ROW_FILE
-    return path.exists() and (not needs_lpips or json.loads(path.read_text())["lpips"] is not None)
+    if not path.exists() or lpips_weights is None:
+        return path.exists()
+    return json.loads(path.read_text()).get("lpips_weights") == str(lpips_weights.resolve())
 
 
-def read_rows(out: Path) -> list[CountRow]:
-    """Return the rows of all runs below `out`, by size, the largest first, and by number of Gaussians."""
-    rows = [CountRow(**json.loads(path.read_text())) for path in out.glob(f"*/*/{ROW_FILE}")]
+def describe_run(data: Path, steps: int, size: int, count: int) -> Origin:
+    """Return the origin of a run with `count` Gaussians on photos of at most `size` pixels."""
+    return describe_origin(data, size=size, count=count, steps=steps)
+
+
+def read_rows(out: Path, data: Path, steps: int) -> list[CountRow]:
+    """Return the rows of all runs below `out`, by size, the largest first, and by number of Gaussians.
+
+    Runs of another version or data set are named and left out, because one law does not describe both.
+    """
+    rows = []
+    for path in sorted(out.glob(f"*/*/{ROW_FILE}")):
+        size, count = (int(folder.name) for folder in (path.parents[1], path.parent))
+        if differences := find_differences(path.parent, describe_run(data, steps, size, count)):
+            print(f"{path.parent} is left out: {'; '.join(differences)}", file=sys.stderr)
+        else:
+            rows.append(CountRow(**json.loads(path.read_text())))
     return sorted(rows, key=lambda row: (-row.size, row.gaussians))
 
 
@@ -164,10 +184,10 @@ def main() -> None:
         for size in () if args.table else args.sizes:
             for count in args.counts:
                 folder = out / str(size) / str(count)
-                remove_outdated(folder, describe_origin(args.data / name, size=size, count=count, steps=args.steps))
-                if not has_row(folder, needs_lpips=args.lpips_weights is not None):
+                remove_outdated(folder, describe_run(args.data / name, args.steps, size, count))
+                if not has_row(folder, args.lpips_weights):
                     measure(args.data / name, size, count, args.steps, folder, args.lpips_weights)
-        rows = read_rows(out)
+        rows = read_rows(out, args.data / name, args.steps)
         print(f"{name}\n\n{format_rows(rows)}\n\n{format_fits(rows)}\n")
         if args.survey:
             write_survey(rows, args.survey, name)

@@ -28,6 +28,7 @@ from hyrfpack.progress import StepEvent, open_display
 from hyrfpack.scene import Scene
 from hyrfpack.train import DensityConfig, TrainConfig, Trainer
 from tools.command import positive_integer, run_command
+from tools.studies.complete_run import train_completely
 
 # A round can at most double the number, and it only splits Gaussians that were visible since the last round.
 SPLIT_ROUNDS, STEPS_PER_ROUND = 20, 6
@@ -100,9 +101,7 @@ def main() -> None:
     source = args.model
     if source is None:
         first = TrainConfig(steps=args.steps, seed=args.seed, log2_table_size=args.log2_table_size)
-        source = hyrfpack.train_model(scene, args.out / "trained", first, overwrite=True).model
-        if source is None:  # interrupted
-            return
+        source = train_completely(scene, args.out / "trained", first).model
     model = hyrfpack.load_model(source)
     tables = (model.config.radiance.log2_table_size, model.config.geometry.log2_table_size)
     if tables != (args.log2_table_size, max(4, args.log2_table_size - 1)):

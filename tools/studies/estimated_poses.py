@@ -20,6 +20,7 @@ import hyrfpack
 from hyrfpack.scene import Scene
 from tools.command import positive_integer, run_command
 from tools.json_files import merge_rows
+from tools.studies.complete_run import train_completely
 from tools.studies.train_sets import DATA_FOLDER, choose_names
 from tools.tables import markdown_table
 
@@ -45,13 +46,8 @@ def select_common_photos(given: Scene, own: Scene) -> tuple[Scene, Scene, int]:
 
 def train_and_score(scene: Scene, out: Path, steps: int, seed: int) -> float:
     """Train a model; return its mean PSNR in dB on held-out photos."""
-    result = hyrfpack.train_model(
-        scene,
-        out,
-        hyrfpack.TrainConfig(steps=steps, seed=seed, budget_factor=1.0),
-        overwrite=True,
-        context=hyrfpack.RunContext(progress=None),
-    )
+    config = hyrfpack.TrainConfig(steps=steps, seed=seed, budget_factor=1.0)
+    result = train_completely(scene, out, config, context=hyrfpack.RunContext(progress=None))
     return result.metrics["evaluation"]["psnr"]
 
 

@@ -30,6 +30,7 @@ from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig
 from tools.command import positive_integer, run_command
 from tools.json_files import write_json
+from tools.studies.complete_run import train_completely
 from tools.studies.reuse import check_origin, describe_origin, write_origin
 from tools.studies.set_variants import load_variant
 from tools.studies.train_sets import DATA_FOLDER, list_sets
@@ -99,10 +100,7 @@ def _train_and_measure(run: QueuedRun, scene: Scene, folder: Path) -> dict:
     if not (folder / METRICS_FILE).exists():
         config = TrainConfig(steps=run.steps, seed=run.seed, exposure=run.exposure)
         resume = (folder / CHECKPOINT_FILE).exists()
-        if not hyrfpack.train_model(
-            scene, folder, config, resume=resume, overwrite=not resume, context=hyrfpack.RunContext(progress=None)
-        ).complete:
-            raise SystemExit("stopped; the same command resumes from the checkpoint")
+        train_completely(scene, folder, config, resume=resume, context=hyrfpack.RunContext(progress=None))
     metrics = json.loads((folder / METRICS_FILE).read_text())
     model = hyrfpack.load_model(folder / MODEL_FILE)
     training = hyrfpack.evaluate_model(model, evenly_spaced(scene.train, MAX_TRAINING_VIEWS_SCORED))

@@ -18,6 +18,7 @@ from pathlib import Path
 import hyrfpack
 from tools.command import run_command
 from tools.studies.compare_versions import DEFAULT_SETS
+from tools.studies.complete_run import train_completely
 from tools.studies.reuse import describe_origin, remove_outdated
 from tools.studies.train_sets import make_study_parser
 from tools.tables import markdown_row, markdown_table
@@ -40,7 +41,7 @@ def measure(data: Path, steps: int, seed: int, out: Path) -> list[tuple[float, f
     packed = out / "compact.hyrf"
     remove_outdated(out, describe_origin(data, steps=steps, seed=seed))
     if not packed.exists():
-        hyrfpack.train_model(reduced, out, hyrfpack.TrainConfig(steps=steps, seed=seed), overwrite=True)
+        train_completely(reduced, out, hyrfpack.TrainConfig(steps=steps, seed=seed))
         hyrfpack.compress_model(out / "model.hyrf", packed)
     columns = []
     for scene in (reduced, photos):

@@ -55,7 +55,7 @@ def describe_own_version() -> str:
         return describe_version(REPOSITORY_ROOT)
     except (HyrfError, FileNotFoundError):
         digest = hashlib.sha256()
-        for path in sorted(REPOSITORY_ROOT.glob("hyrfpack/**/*.py")):
+        for path in sorted(path for folder in SOURCE_FOLDERS for path in REPOSITORY_ROOT.glob(f"{folder}/**/*.py")):
             digest.update(str(path.relative_to(REPOSITORY_ROOT)).encode() + path.read_bytes())
         return f"sources-{digest.hexdigest()[:DIGEST_CHARACTERS]}"
 

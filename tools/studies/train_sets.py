@@ -28,6 +28,7 @@ from hyrfpack.errors import HyrfError
 from hyrfpack.train import TrainConfig
 from tools.command import positive_integer, run_command
 from tools.json_files import merge_rows
+from tools.studies.complete_run import train_completely
 from tools.studies.reuse import ORIGIN_FILE, check_origin, describe_origin, write_origin
 from tools.studies.set_variants import load_variant
 from tools.tables import markdown_table
@@ -81,7 +82,7 @@ def measure(data: Path, name: str, out: Path, config: TrainConfig, reuse: bool) 
         check_origin(out, origin)
     else:
         (out / ORIGIN_FILE).unlink(missing_ok=True)
-        hyrfpack.train_model(scene, out, config, overwrite=True)
+        train_completely(scene, out, config)
         write_origin(out, origin)
     trained = json.loads((out / "metrics.json").read_text())
     model = out / "model.hyrf"

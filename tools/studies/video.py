@@ -32,6 +32,7 @@ from hyrfpack.poses.frames import RECORD_NAME, FrameReport, choose_frames
 from hyrfpack.scene import Picture, Scene, View
 from hyrfpack.train import TrainConfig
 from tools.command import positive_integer, run_command
+from tools.studies.complete_run import train_completely
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import print_measured_table
 
@@ -170,7 +171,7 @@ def hold_out(scene: Scene, photo_by_view: Mapping[str, str], held_out: Sequence[
 
 def train_and_score(scene: Scene, out: Path, steps: int) -> float:
     """Train on a scene; return PSNR in dB on its held-out photos."""
-    result = hyrfpack.train_model(scene, out / "run", TrainConfig(steps=steps, budget_factor=1.0), overwrite=True)
+    result = train_completely(scene, out / "run", TrainConfig(steps=steps, budget_factor=1.0))
     return result.metrics["evaluation"]["psnr"]
 
 

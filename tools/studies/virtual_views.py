@@ -23,13 +23,15 @@ from pathlib import Path
 
 import hyrfpack
 from hyrfpack.context import RunContext
+from hyrfpack.errors import HyrfError
 from hyrfpack.scene import Scene, View, evenly_spaced
-from hyrfpack.train import TrainConfig, train_model
+from hyrfpack.train import TrainConfig
 from hyrfpack.train.pilots import split
 from hyrfpack.train.resolution import PhotoSize
 from hyrfpack.train.teachers import count_teachers
 from tools.command import positive_integer, run_command
 from tools.json_files import merge_rows
+from tools.studies.complete_run import train_completely
 from tools.studies.set_variants import load_variant
 from tools.studies.train_sets import DATA_FOLDER
 from tools.tables import markdown_row, markdown_table
@@ -59,9 +61,14 @@ def load_photos(data: Path, name: str, fold: int) -> tuple[Scene, list[View]]:
 
     Args:
         data: folder of the sets.
-        name: name of a set or variant.
+        name: name of a set, or of its variant with fewer photos.
         fold: number of the fold of a full set.
+
+    Raises:
+        HyrfError: the variant has other changes, which its validation photos would lack.
     """
+    if any(not change.isdecimal() for change in name.split("@")[1:]):
+        raise HyrfError(f"'{name}': its photos are changed", fix="name a set, or a variant with fewer photos")
     scene = load_variant(data, name)
     if "@" not in name:
         training, validation = split(scene.train, VALIDATION_EVERY, MAX_SPLIT_VIEWS_SCORED, fold)
@@ -75,10 +82,8 @@ def train_and_score(scene: Scene, validation: list[View], config: TrainConfig) -
     """Train a run in a temporary folder, and score its model on validation photos."""
     start = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
-        result = train_model(scene, folder, config, context=RunContext(progress=None))
+        result = train_completely(scene, Path(folder), config, context=RunContext(progress=None))
         seconds = time.process_time() - start
-        if result.model is None:
-            raise KeyboardInterrupt
         scores = hyrfpack.evaluate_model(hyrfpack.load_model(result.model), validation)
     return Scores(scores.psnr, scores.ssim, seconds)
 
