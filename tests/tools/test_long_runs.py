@@ -52,15 +52,16 @@ def test_a_run_that_another_call_trains_is_skipped(run_tool, tmp_path):
     assert "another" in printed
 
 
-def test_a_stopped_run_resumes_from_its_checkpoint(run_tool, monkeypatch):
+@pytest.mark.parametrize("left", ["checkpoint.pt", "pilot.pt", "teacher-1.hyrf"])
+def test_a_stopped_run_resumes_from_what_it_has_left(run_tool, monkeypatch, left):
     train, resumed = long_runs.hyrfpack.train_model, []
 
     def stop_once(scene, folder, config, *, resume, **options):
         resumed.append(resume)
         if len(resumed) == 1:
-            (folder / "checkpoint.pt").touch()
+            (folder / left).touch()
             return TrainResult(False, 5, None, {})
-        (folder / "checkpoint.pt").unlink(missing_ok=True)
+        (folder / left).unlink(missing_ok=True)
         return train(scene, folder, config, context=QUIET_CONTEXT)
 
     monkeypatch.setattr(long_runs.hyrfpack, "train_model", stop_once)

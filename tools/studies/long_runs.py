@@ -3,7 +3,7 @@
     python -m tools.studies.long_runs --steps 1000 3000 7000 30000 --sets drone_brighton_beach mipnerf360_bonsai@12
     python -m tools.studies.long_runs --steps 30000 --table                     only prints the table
 
-Short runs come first. If a call is stopped, the next one resumes from the checkpoint and does not repeat finished runs.
+Short runs come first. If a call is stopped, the next one resumes its run and does not repeat finished runs.
 Runs of another version or data set are named, and neither resumed nor repeated. Several calls can share one queue,
 because each run's folder is locked while it is trained and measured. --finetune adds a fine-tuned file also to finished
 runs. The table has PSNR in dB and SSIM of the raw file on held-out photos, and the gap, which is PSNR on up to 16
@@ -24,10 +24,11 @@ from pathlib import Path
 
 import hyrfpack
 from hyrfpack.errors import HyrfError
-from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
+from hyrfpack.format.run_folder import METRICS_FILE, MODEL_FILE
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.scene import Scene, evenly_spaced
 from hyrfpack.train import TrainConfig
+from hyrfpack.train.run import is_begun
 from tools.command import positive_integer, run_command
 from tools.json_files import write_json
 from tools.studies.complete_run import train_completely
@@ -69,7 +70,7 @@ def measure(run: QueuedRun, data: Path, out: Path, finetune_steps: int) -> bool:
     """
     folder = run.folder(out)
     origin = describe_origin(data / run.name, **asdict(run))
-    if any((folder / name).exists() for name in (MEASUREMENT_FILE, METRICS_FILE, CHECKPOINT_FILE)):
+    if is_begun(folder) or any((folder / name).exists() for name in (MEASUREMENT_FILE, METRICS_FILE)):
         check_origin(folder, origin)
     else:
         write_origin(folder, origin)
@@ -99,7 +100,7 @@ def _train_and_measure(run: QueuedRun, scene: Scene, folder: Path) -> dict:
     """Train a run unless its metrics are there, compress and score it, and return its row."""
     if not (folder / METRICS_FILE).exists():
         config = TrainConfig(steps=run.steps, seed=run.seed, exposure=run.exposure)
-        resume = (folder / CHECKPOINT_FILE).exists()
+        resume = is_begun(folder)
         train_completely(scene, folder, config, resume=resume, context=hyrfpack.RunContext(progress=None))
     metrics = json.loads((folder / METRICS_FILE).read_text())
     model = hyrfpack.load_model(folder / MODEL_FILE)
