@@ -111,7 +111,7 @@ def quantized_provenance(provenance: dict, scale: float, points: np.ndarray | No
         farthest = max((float(np.linalg.norm(camera.position)) for camera in cameras), default=0.0)
         # Rounding a rotation moves the camera in proportion to its distance from the origin.
         decimals = (
-            int(np.clip(np.ceil(np.log10(max(2 * farthest / scale, 1e-9) * COARSE_POSE_STEPS_PER_SCENE_SCALE)), 4, 9)),
+            int(np.clip(np.ceil(np.log10(max(2 * farthest / scale, 1e-9) * COARSE_POSE_STEPS_PER_SCENE_SCALE)), 4, 15)),
             int(np.clip(np.ceil(np.log10(COARSE_POSE_STEPS_PER_SCENE_SCALE / scale)), 0, MAX_COARSE_DECIMALS)),
         )
         shortened["coarse_cameras"] = [camera_to_numbers(camera, decimals) for camera in cameras]

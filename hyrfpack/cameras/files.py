@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera, rigid_pose
 
 MAX_IMAGE_SIDE_PIXELS = 16384  # a larger number in a file is treated as a mistake, and larger photos are refused
+MAX_SIGNIFICANT_DIGITS = 17  # of a float64
 INTRINSICS_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 _FOCAL_KEYS = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")
 
@@ -46,15 +48,12 @@ def camera_to_numbers(camera: Camera, decimals: tuple[int, int] | None = None) -
     Args:
         camera: the camera.
         decimals: decimal places of the rotation (at least 4, otherwise it is no longer rigid) and of the translation;
-            intrinsics are rounded to one place. None rounds all numbers by `round_number`.
+            intrinsics are rounded to one place. None rounds intrinsics by `round_number` and the pose by `round_pose`.
     """
     pose = camera.camera_from_world[:3].tolist()
     if decimals is None:
-        return [
-            camera.width,
-            camera.height,
-            *map(round_number, (*camera.intrinsics, *(x for row in pose for x in row))),
-        ]
+        rounded = round_pose(pose)
+        return [camera.width, camera.height, *map(round_number, camera.intrinsics), *chain(*rounded)]
     rotation, translation = decimals
     rows = ([*(round(x, rotation) for x in row[:3]), round(row[3], translation)] for row in pose)
     lens = (round(number, 1) for number in camera.intrinsics)
@@ -208,6 +207,18 @@ def _focal_length(value: Any) -> float:
     if not value > 0:
         raise ValueError(f"a focal length of {value} pixels")
     return value
+
+
+def round_pose(rows: Sequence[Sequence[float]]) -> list[list[float]]:
+    """Round a pose of rows (3 or 4) x 4, so that the position of its camera keeps six decimal places.
+
+    The translation is rounded by `round_number`. The rotation has nine significant digits, and as many more as the
+    distance d of the camera from the world's origin has digits above 1,000, because its rounding moves the camera in
+    proportion to d.
+    """
+    distance = math.hypot(*(row[3] for row in rows[:3]))
+    digits = 9 if distance < 1000 else min(7 + math.ceil(math.log10(distance)), MAX_SIGNIFICANT_DIGITS)
+    return [[*(float(f"{x:.{digits}g}") for x in row[:3]), round_number(row[3])] for row in rows]
 
 
 def round_number(number: float) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hyrfpack.cameras.files import INTRINSICS_KEYS, camera_from_json, check_json_numbers, round_number
+from hyrfpack.cameras.files import INTRINSICS_KEYS, camera_from_json, check_json_numbers, round_number, round_pose
 from hyrfpack.cameras.placement import unit_vector
 from hyrfpack.rotations import IDENTITY, rotation_matrix
 from hyrfpack.scene import Camera
@@ -120,7 +120,7 @@ class Viewpoint:
         """Convert to a dictionary ready for JSON, the "viewpoint" of a file's provenance.
 
         Args:
-            rounded: round all numbers by `round_number`.
+            rounded: round the pose by `round_pose`, and all other numbers by `round_number`.
         """
         numbers = {
             "center": self.center.tolist(),
@@ -131,7 +131,9 @@ class Viewpoint:
             "height": self.camera.height,
             "arc": list(self.arc),
         }
-        return _round_numbers(numbers) if rounded else numbers
+        if not rounded:
+            return numbers
+        return {**_round_numbers(numbers), "camera_from_world": round_pose(numbers["camera_from_world"])}
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Viewpoint:

@@ -98,13 +98,13 @@ def bench(
     require_matplotlib()
     scene = None if data is None or model is None else read_scene(data, reader_options, describe_file(model))
     folder = None if model is None else find_input_folder(model)
-    outputs = Outputs(model, folder=folder, scene=scene, overwrite=overwrite)
+    outputs = Outputs(model, folders=[folder], scene=scene, overwrite=overwrite)
     outputs.file(output)
     page = _read_page(markdown)
     if page:  # check before minutes of work that the page has a place for each table
         tables.fill_page(page, dict.fromkeys(("machine", *(only or BENCH_GROUPS)), ""), str(markdown))
     if markdown is not None:  # an existing page with places is filled, which needs no permission to overwrite
-        Outputs(model, folder=folder, scene=scene, overwrite=overwrite or bool(page)).file(markdown)
+        Outputs(model, folders=[folder], scene=scene, overwrite=overwrite or bool(page)).file(markdown)
     with notes_only_of("hyrfpack.bench"):
         result = benchmark_model(model, scene, repeats=repeats, only=only or None)
     if as_json:

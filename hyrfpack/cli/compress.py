@@ -172,7 +172,7 @@ def decompress(file: Path, output: Path, fraction: float | None, overwrite: bool
     from hyrfpack.format.input_folder import find_input_folder
 
     file = resolve_model_file(file)
-    Outputs(file, folder=find_input_folder(file), overwrite=overwrite).file(output, ".hyrf")
+    Outputs(file, folders=[find_input_folder(file)], overwrite=overwrite).file(output, ".hyrf")
     result = repack(file, output, fraction=fraction, overwrite=overwrite)
     note_rename(output, result.file)
     if as_json:

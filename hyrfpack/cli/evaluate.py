@@ -77,7 +77,7 @@ def evaluate(
         scene = read_scene(data, reader_options, source.facts)
         views = select_views(scene, split)
         if pictures is not None:
-            outputs = Outputs(source.path, lpips_weights, folder=source.folder, scene=scene, overwrite=overwrite)
+            outputs = Outputs(source.path, lpips_weights, folders=[source.folder], scene=scene, overwrite=overwrite)
             outputs.folder(pictures, picture_names(views).values())
         return drawn_model, scene, views
 

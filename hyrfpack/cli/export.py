@@ -133,7 +133,7 @@ def export(
         check_export_folder(output, models, scenes, overwrite=overwrite, is_gallery=len(models) > 1)
     else:
         folder, scene = find_input_folder(files[0]), scenes[0] if scenes else None
-        check_export_target(output, Outputs(*files, folder=folder, scene=scene, overwrite=overwrite), config)
+        check_export_target(output, Outputs(*files, folders=[folder], scene=scene, overwrite=overwrite), config)
     report = _write_export(models, scenes, output, config, overwrite=overwrite)
     note_rename(output, report.file)
     if as_json:

@@ -137,7 +137,7 @@ def render(
 
     def check(replace: bool) -> None:
         if ranks.is_main:
-            outputs = Outputs(source.path, cameras, folder=source.folder, scene=scene, overwrite=replace)
+            outputs = Outputs(source.path, cameras, folders=[source.folder], scene=scene, overwrite=replace)
             outputs.folder(output, names)
 
     def write() -> tuple[list[Path], float]:

@@ -62,12 +62,17 @@ def read_gray(path: StrPath) -> np.ndarray:
         >>> read_gray("wide.png").shape
         (450, 800)
     """
+    return read_gray_and_transparency(path)[0]
+
+
+def read_gray_and_transparency(path: StrPath) -> tuple[np.ndarray, bool]:
+    """Return what `read_gray` does, and whether some of the photo's pixels are transparent, as those of a cut-out."""
     path = Path(path)
     stored = read_header(path).size
     wanted = fit_size(*stored, MEASURED_SIDE_PIXELS)
     rgb, alpha = read_pixels(path, None if wanted == stored else wanted)
     gray = rgb @ (_LUMA_WEIGHTS / 255)
-    return gray if alpha is None else gray * (alpha * np.float32(1 / 255))
+    return (gray, False) if alpha is None else (gray * (alpha * np.float32(1 / 255)), bool((alpha < 255).any()))
 
 
 def measure_sharpness(gray: np.ndarray) -> float:

@@ -76,8 +76,8 @@ def refit_region(
     if not shown:
         raise HyrfError(
             f"none of the {len(views)} training photos shows the {format_count(is_selected.sum(), 'Gaussian')} of the "
-            "region",
-            fix="choose another region",
+            f"region in at least {MIN_REGION_LIGHT_PIXELS:g} pixels",
+            fix="choose a larger region, or larger photos with `max_size`",
         )
     cache = PictureCache()
     gains = fit_residual_gains(model, shown, cache) if has_gains else {}

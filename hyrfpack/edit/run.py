@@ -10,7 +10,7 @@ from pathlib import Path
 
 from hyrfpack.checks import check_type
 from hyrfpack.compress import CompressionReport
-from hyrfpack.config.edit import Action, EditLimits
+from hyrfpack.config.edit import Action, CropMasks, EditLimits, Refit, Remove
 from hyrfpack.context import RunContext
 from hyrfpack.edit.apply import Edit, apply_actions, open_scene
 from hyrfpack.edit.merge import extract_part
@@ -77,7 +77,7 @@ def edit_model(
         (2, 'compact')
     """
     path = _check_request(source, actions, data, part, limits)
-    outputs = Outputs(path, scene=data, overwrite=overwrite)
+    outputs = Outputs(path, folders=_mask_folders(actions), scene=data, overwrite=overwrite)
     outputs.file(target, ".hyrf")
     if picture is not None:
         outputs.file(picture, *PICTURE_ENDINGS)
@@ -132,7 +132,7 @@ def plan_edit(
     """
     path = _check_request(source, actions, data, part)
     if picture is not None:
-        Outputs(path, scene=data, overwrite=overwrite).file(picture, *PICTURE_ENDINGS)
+        Outputs(path, folders=_mask_folders(actions), scene=data, overwrite=overwrite).file(picture, *PICTURE_ENDINGS)
     with tempfile.TemporaryDirectory() as folder, context.open_progress("edit") as progress:
         opened = open_scene(extract_part(path, part, folder), path, data, part_of_progress(progress, 0, 0.5))
         edit = apply_actions(opened, actions)
@@ -164,6 +164,17 @@ def _check_request(
     if data is not None:
         check_type("data", data, Scene)
     return find_model(source)
+
+
+def _mask_folders(actions: Sequence[Action]) -> list[str]:
+    """Return the folders of masks that actions read, those of a region or an inverted crop, too."""
+    folders = []
+    for action in actions:
+        region = action.region if isinstance(action, Refit) else action
+        crop = region.crop if isinstance(region, Remove) else region
+        if isinstance(crop, CropMasks):
+            folders.append(crop.folder)
+    return folders
 
 
 def _measure_changes(edit: Edit, progress: Progress) -> EditReport:

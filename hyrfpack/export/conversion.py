@@ -16,7 +16,7 @@ from hyrfpack.checks import check_type
 from hyrfpack.config.export import ConvertConfig
 from hyrfpack.context import RunContext
 from hyrfpack.counts import format_count
-from hyrfpack.errors import HyrfDataError, HyrfError, suggest_command
+from hyrfpack.errors import HyrfError, suggest_command
 from hyrfpack.export.kinds import (
     STREAMED_SOG_FOLDER,
     check_package,
@@ -112,7 +112,7 @@ def convert_splats(
     check_type("config", config, ConvertConfig)
     check_spz_version(kind, target, config)
     check_package(kind, target)
-    Outputs(source, folder=find_sog_folder(source), overwrite=overwrite).file(target)
+    Outputs(source, folders=[find_sog_folder(source)], overwrite=overwrite).file(target)
     with context.open_progress("convert") as progress:
         return _convert(source, target, kind, config, overwrite, progress)
 
@@ -128,11 +128,6 @@ def _convert(
     """Read, select, write and measure splats."""
     progress(TaskEvent(f"reading {Path(source).name}", 0.0))
     splats = read_splats(source)
-    if not len(splats):
-        raise HyrfDataError(
-            f"{source}: there is no Gaussian in it, so there is nothing to convert",
-            fix="name another file",
-        )
     cropped = splats if config.crop is None else select_splats(splats, config.crop)
     selected = select_splats(cropped, None, config.min_opacity)
     max_degree = kind.max_degree if config.degree is None else min(kind.max_degree, config.degree)

@@ -275,7 +275,7 @@ def check_export_folder(
     files = [find_playable_file(source) for source in sources]
     input_folders = [find_input_folder(file) for file in files] or [None]
     for input_folder, scene in zip_longest(input_folders, scenes):
-        Outputs(*files, folder=input_folder, scene=scene, overwrite=overwrite).folder(folder, names)
+        Outputs(*files, folders=[input_folder], scene=scene, overwrite=overwrite).folder(folder, names)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ from hyrfpack.export.cameras import COLMAP_FILES
 from hyrfpack.export.source import Source
 from hyrfpack.model.merged import world_positions
 from hyrfpack.outputs import Outputs
-from hyrfpack.splats.formats.spz import MAX_SCALE
+from hyrfpack.splats.formats import spz
+from hyrfpack.splats.placement import choose_local_origin
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import FORMATS, FileKind
 
@@ -43,7 +44,7 @@ _KINDS_WITHOUT_COLORS = (TRANSFORMS_JSON, *COLLISION_FILES)
 PLAYER_FOLDER = FileKind(ending="")
 STREAMED_SOG_FOLDER = FileKind(ending="lod-meta.json", stores_antialiased=True)  # the folder's index
 TILES_FOLDER = FileKind(ending="tileset.json")  # the folder's index
-SPZ_TILES_FOLDER = replace(TILES_FOLDER, max_scale=MAX_SCALE)  # positions are relative to an origin in the scene
+SPZ_TILES_FOLDER = replace(TILES_FOLDER, max_scale=spz.MAX_SCALE)  # positions are relative to an origin in the scene
 LEVEL_FOLDERS = (STREAMED_SOG_FOLDER, TILES_FOLDER, SPZ_TILES_FOLDER)  # levels of detail, of a scene folder
 _FILE_KINDS = (*POINT_FILES, *COLLISION_FILES, *MESH_FILES, *FORMATS.values(), HTML_PAGE, TRANSFORMS_JSON)
 _KINDS_BY_ENDING = {kind.ending: kind for kind in _FILE_KINDS}
@@ -254,6 +255,14 @@ def check_model(loaded: Source, kind: FileKind, config: ExportConfig) -> None:
     if crop is not None or min_opacity > 0:  # certain before the bake, because it raises no opacity
         opacities = model.decode_geometry().opacities.numpy()
         positions = positions[make_selection_mask(positions, opacities, crop, min_opacity)]
+    if kind is SPZ_TILES_FOLDER:
+        reach = float(np.abs(positions - choose_local_origin(positions)).max())
+        if reach > spz.MAX_COORDINATE:
+            raise HyrfError(
+                f"the Gaussians reach {reach:,.0f} units from the origin of the tiles, but SPZ is limited to "
+                f"{spz.MAX_COORDINATE:,}",
+                fix="use `tile_content='gltf'`, or leave out the far Gaussians with `crop`",
+            )
     reach, limit = float(np.abs(positions).max()), f"but {kind.ending} is limited to {kind.max_coordinate:,}"
     if reach > kind.max_coordinate:
         low, high = positions.min(axis=0), positions.max(axis=0)

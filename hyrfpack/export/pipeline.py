@@ -155,9 +155,9 @@ def _export_file(
     folder = find_input_folder(model)
     is_folder = kind is COLMAP_FOLDER or kind in LEVEL_FOLDERS
     if is_folder:
-        check_export_target(target, Outputs(model, folder=folder, scene=data, overwrite=True), config)
+        check_export_target(target, Outputs(model, folders=[folder], scene=data, overwrite=True), config)
     with exclusive_folder(target) if is_folder else nullcontext():
-        check_export_target(target, Outputs(model, folder=folder, scene=data, overwrite=overwrite), config)
+        check_export_target(target, Outputs(model, folders=[folder], scene=data, overwrite=overwrite), config)
         data = place_photos(describe_file(source), data)
         loaded = Source.read(source, data)
         if kind is HTML_PAGE and not config.baked:

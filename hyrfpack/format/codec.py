@@ -203,7 +203,7 @@ def repack(
             call is kept, and a free file name in the same folder is used, which the report contains.
     """
     source = find_model(source)
-    Outputs(source, folder=find_input_folder(source), overwrite=overwrite).file(target)
+    Outputs(source, folders=[find_input_folder(source)], overwrite=overwrite).file(target)
     parts = []
     for name, model, provenance in load_parts(source, fraction):
         stored_provenance = provenance if profile == "raw" else packed_provenance(provenance, model)

@@ -135,7 +135,7 @@ def check_target(
         overwrite: an existing file may be replaced, except those that are read.
     """
     folder = None if source is None else find_sog_folder(source)
-    Outputs(source, cameras, folder=folder, scene=scene, overwrite=overwrite).file(target, ".hyrf")
+    Outputs(source, cameras, folders=[folder], scene=scene, overwrite=overwrite).file(target, ".hyrf")
 
 
 @explain_out_of_memory(OUT_OF_MEMORY_FIX)

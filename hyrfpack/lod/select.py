@@ -132,8 +132,6 @@ def _lower_hull(costs: Sequence[float], errors: Sequence[float]) -> list[int]:
     for level in sorted(range(len(costs)), key=lambda level: (costs[level], errors[level])):
         if hull and errors[level] >= errors[hull[-1]]:
             continue
-        if hull and costs[level] == costs[hull[-1]]:
-            hull.pop()
         while len(hull) > 1:
             a, b = hull[-2:]
             rises = (errors[b] - errors[a]) * (costs[level] - costs[a])

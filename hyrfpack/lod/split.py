@@ -39,6 +39,7 @@ from hyrfpack.format.scene_manifest import (
 )
 from hyrfpack.format.scene_model import join_parts
 from hyrfpack.format.sections import SECTION_CONTENTS
+from hyrfpack.format.shared import open_shared
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.lod.encode import ChunkEncoder
 from hyrfpack.lod.errors import ERROR_RADII, measure_level_errors
@@ -150,15 +151,18 @@ def split_model(
             fix="name another folder",
         )
     shared_names = _name_shared_files(path)
-    Outputs(path, scene=data, overwrite=True).folder(target, [MANIFEST_NAME, *shared_names])
+    # A chunk of the scene that would be replaced is no source: the old files are removed.
+    planned = [MANIFEST_NAME, *shared_names, *_list_old_files(target)]
+    Outputs(*_list_inputs(path), scene=data, overwrite=True).folder(target, planned)
     facts = describe_file(path)
     data = place_photos(facts, data)
     if mismatch := Capture(facts, data).mismatch:
         raise HyrfDataError(mismatch, fix=MISMATCH_REMEDY)
+    outputs = Outputs(*_list_inputs(path), scene=data, overwrite=overwrite)
     with exclusive_folder(target), context.open_progress("split") as progress:
-        Outputs(path, scene=data, overwrite=overwrite).folder(target, [MANIFEST_NAME, *shared_names])
+        outputs.folder(target, [MANIFEST_NAME, *shared_names])
         files, manifest = _encode_scene(path, shared_names, name_model(source), config, data, progress)
-        Outputs(path, scene=data, overwrite=overwrite).folder(target, files)
+        outputs.folder(target, files)
         _check_manifest(manifest, target / MANIFEST_NAME)
         _write_folder(target, files, manifest, overwrite)
     levels = list(zip(*(chunk.levels for chunk in manifest.chunks), strict=True))
@@ -206,6 +210,12 @@ class _Part:
     def model(self) -> HybridModel:
         """Return the model of all Gaussians of the part."""
         return self.encoder.model
+
+
+def _list_inputs(path: Path) -> list[str]:
+    """Return the paths of a file and of the other file that its sections refer to, if it is a chunk of a scene."""
+    with Container.open(path, SECTION_CONTENTS) as container:
+        return [str(path), open_shared(container).name]
 
 
 def _name_shared_files(path: Path) -> list[str]:

@@ -123,9 +123,9 @@ class Source:
         """Return the rules that protect the source from being overwritten; all of them apply."""
         if self.kind == "photos":
             folders = sorted({photo.parent for photo in list_photos(self.path)} | {self.path})
-            return [Outputs(folder=folder, overwrite=overwrite) for folder in folders]
+            return [Outputs(folders=folders, overwrite=overwrite)]
         folder = self.path.parent if self.path.name == SOG_META_NAME else self.path
-        return [Outputs(self.path, folder=folder, scene=self.scene, overwrite=overwrite)]
+        return [Outputs(self.path, folders=[folder], scene=self.scene, overwrite=overwrite)]
 
 
 def _list_names(folder: Path) -> list[str] | None:

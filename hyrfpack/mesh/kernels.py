@@ -96,7 +96,7 @@ def fuse_block(low, voxel, truncation, views, poses, lenses, sizes, depth, weigh
                 y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
                 z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
                 for k in range(count):
-                    if z > 1e-9:
+                    if z > 0:
                         u, v = fx * x / z + cx, fy * y / z + cy
                         if u >= 0 and v >= 0 and u < width and v < height:
                             surface, w = _look_up(depth, weight, width, height, start, u, v, truncation)
@@ -129,7 +129,7 @@ def color_points(first, last, points, tolerance, poses, lenses, sizes, depth, we
             x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
             y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
             z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
-            if z <= 1e-9:
+            if not z > 0:
                 continue
             u, v = fx * x / z + cx, fy * y / z + cy
             if not (u >= 0 and v >= 0 and u < width and v < height):

@@ -48,7 +48,7 @@ class Outputs:
     def __init__(
         self,
         *files: StrPath | None,
-        folder: StrPath | None = None,
+        folders: Iterable[StrPath | None] = (),
         scene: Scene | None = None,
         overwrite: bool = False,
     ) -> None:
@@ -56,14 +56,14 @@ class Outputs:
 
         Args:
             files: files that are read; None and files that do not exist are ignored.
-            folder: a folder whose files are all read.
+            folders: folders whose files are all read; None is ignored.
             scene: photos and poses that are read.
             overwrite: existing files may be replaced, except those that are read.
         """
         self.overwrite = overwrite
         self._files = _file_ids(filter(None, files))
         self._folders: set[tuple[int, int]] = set()
-        if folder is not None and os.path.isdir(folder):
+        for folder in (item for item in folders if item is not None and os.path.isdir(item)):
             self._files |= _file_ids(Path(folder, name) for name in _entry_names(folder))
             self._folders |= _file_ids([folder])
         if scene is not None:

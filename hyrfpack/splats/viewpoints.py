@@ -65,8 +65,11 @@ class WeightedSplats:
             name: the file's name in error messages.
 
         Raises:
-            HyrfDataError: no splat is visible; each has opacity 0 or no area.
+            HyrfDataError: there are no splats, none is visible because each has opacity 0 or no area, or all lie at
+                one place.
         """
+        if not len(splats):
+            raise HyrfDataError(f"{name}: there is no Gaussian in it", fix="name another file")
         sides = np.sort(splats.scales.astype(np.float64), axis=1)
         discs = sides[:, 1] * sides[:, 2]
         areas = splats.opacities * discs
@@ -79,9 +82,14 @@ class WeightedSplats:
         typical = np.median(discs[is_visible])
         detail_weights = np.where(is_visible, splats.opacities * (typical / np.maximum(discs, typical)), 0.0)
         areas = np.minimum(areas, np.quantile(areas[is_visible], MAX_AREA_QUANTILE))
-        frame = Frame.from_box(
-            *_compute_quantile_box(splats.positions[is_visible], sides[is_visible, 2], detail_weights[is_visible])
+        low, high = _compute_quantile_box(
+            splats.positions[is_visible], sides[is_visible, 2], detail_weights[is_visible]
         )
+        if not (high > low).any():
+            raise HyrfDataError(
+                f"{name}: all Gaussians lie at one place, and are too small there for float32", fix="give another file"
+            )
+        frame = Frame.from_box(low, high)
         boxes_away = np.abs(frame.to_local(splats.positions) / frame.half_extent).max(axis=1)
         return cls(splats, areas, detail_weights, frame, areas / np.maximum(boxes_away, 1) ** 4)
 

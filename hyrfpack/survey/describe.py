@@ -137,7 +137,7 @@ def _describe(path: Path, report_progress: Progress) -> PhotoSurvey:
     problems += unreadable_sentences(unreadable, len(photos))
     problems += find_copy_problems(photos, measurements, unreadable, folder, report_progress)
     problems += find_blur_problems(median_sharpness, blurred, folder)
-    problems += find_light_problems(measurements, log_luminances, stops, folder, scene)
+    problems += find_light_problems(measurements, log_luminances, stops, folder)
     if scene is None:
         problems += find_zoom_problems(facts) + find_mask_problems(folder, photos, facts)
     notes = (

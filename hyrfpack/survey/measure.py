@@ -11,7 +11,13 @@ from PIL import Image
 
 from hyrfpack.data.archive import display_path
 from hyrfpack.data.folder import PhotoFacts, read_photo_facts
-from hyrfpack.data.quality import MIN_SHARPNESS_SIDE_PIXELS, Exposure, measure_exposure, measure_sharpness, read_gray
+from hyrfpack.data.quality import (
+    MIN_SHARPNESS_SIDE_PIXELS,
+    Exposure,
+    measure_exposure,
+    measure_sharpness,
+    read_gray_and_transparency,
+)
 from hyrfpack.errors import HyrfDataError, strip_path
 from hyrfpack.parallel.threads import thread_count
 from hyrfpack.progress import Progress, TaskEvent
@@ -35,12 +41,14 @@ class PhotoMeasurement:
         sharpness: its sharpness; None for a picture that is too small to measure.
         exposure: its luminance and clipping.
         thumbnail: (_THUMBNAIL_SIDE_PIXELS, _THUMBNAIL_SIDE_PIXELS) grey levels in [0, 255].
+        is_cut_out: whether some of its pixels are transparent; they are black in the measurements.
     """
 
     path: Path
     sharpness: float | None
     exposure: Exposure
     thumbnail: np.ndarray
+    is_cut_out: bool
 
 
 def read_header_facts(
@@ -80,12 +88,12 @@ def measure_pixels(
 def _measure_one(path: Path) -> PhotoMeasurement | str:
     """Measure the pixels of a photo; return the reason if it cannot be decoded."""
     try:
-        gray = read_gray(path)
+        gray, is_cut_out = read_gray_and_transparency(path)
     except HyrfDataError as error:
         return strip_path(error, display_path(path))
     small = Image.fromarray(gray).resize((_THUMBNAIL_SIDE_PIXELS, _THUMBNAIL_SIDE_PIXELS), Image.Resampling.BOX)
     sharpness = measure_sharpness(gray) if min(gray.shape) >= MIN_SHARPNESS_SIDE_PIXELS else None
-    return PhotoMeasurement(path, sharpness, measure_exposure(gray), 255 * np.asarray(small))
+    return PhotoMeasurement(path, sharpness, measure_exposure(gray), 255 * np.asarray(small), is_cut_out)
 
 
 def relative_name(path: Path, folder: Path) -> str:

@@ -148,10 +148,10 @@ def find_blur_problems(median_sharpness: float, blurred: list[Path], folder: Pat
 
 
 def find_light_problems(
-    measurements: list[PhotoMeasurement], log_luminances: np.ndarray, stops: float, folder: Path, scene: Scene | None
+    measurements: list[PhotoMeasurement], log_luminances: np.ndarray, stops: float, folder: Path
 ) -> list[str]:
     """Describe dark, clipped or unevenly exposed photos."""
-    if scene is not None and scene.has_alpha:
+    if any(measurement.is_cut_out for measurement in measurements):
         return []  # transparent pixels are not dark
     problems = []
     median = float(np.median(log_luminances))

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenes import ball_scene, ring
+from scipy.spatial.transform import Rotation
 
 from hyrfpack.cameras.capture import (
     COARSE_POSE_STEPS_PER_SCENE_SCALE,
@@ -20,9 +21,12 @@ from hyrfpack.cameras.capture import (
     quantized_provenance,
     scene_provenance,
 )
+from hyrfpack.cameras.files import camera_from_numbers
 from hyrfpack.cameras.paths import Viewpoint, orbit
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera, evenly_spaced
+
+GEOCENTRIC_POSITION = np.array([4027893.7, 1307045.2, 4919474.9])  # metres from the centre of the earth
 
 
 def make_description(**provenance) -> dict:
@@ -169,6 +173,30 @@ def test_photos_of_another_scene_or_frame_do_not_match_the_stored_cameras(kind):
         ]
         sentence = Capture(model, replace(scene, path="other", train=views, test=[])).mismatch
         assert sentence.startswith("other: of the ") and "another coordinate frame" in sentence
+
+
+@pytest.mark.parametrize("scale", [0.075, 1.0])
+@pytest.mark.parametrize("kind", ["all cameras", "coarse cameras"])
+def test_photos_in_geocentric_coordinates_match_the_cameras_of_their_model(kind, scale):
+    turn = Rotation.random(random_state=1).as_matrix()
+    cameras = []
+    for view in ball_scene(24).train:
+        pose = view.camera.camera_from_world.copy()
+        pose[:3, :3] = pose[:3, :3] @ turn
+        pose[:3, 3] = scale * pose[:3, 3] - pose[:3, :3] @ GEOCENTRIC_POSITION
+        cameras.append(replace(view.camera, camera_from_world=pose))
+    views = [replace(view, camera=camera) for view, camera in zip(ball_scene(24).train, cameras, strict=True)]
+    scene = replace(ball_scene(24), train=views, test=[])
+    kept = json.loads(json.dumps(scene_provenance(scene)))
+    kept = kept if kind == "all cameras" else json.loads(json.dumps(quantized_provenance(kept, scale)))
+    facts = make_description(**kept)
+    facts["config"]["frame"]["scale"] = scale
+
+    assert Capture(facts, scene).mismatch == ""
+    if kind == "all cameras":
+        stored = [camera_from_numbers(numbers) for numbers in kept["cameras"]]
+        moved = [np.abs(mine.position - given.position).max() for mine, given in zip(stored, cameras, strict=True)]
+        assert max(moved) < 1e-5
 
 
 def test_one_common_camera_is_not_enough_for_a_match():

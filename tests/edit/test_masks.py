@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,9 @@ from commands import refused, succeeded
 from PIL import Image
 from scenes import QUIET_CONTEXT, ring, small_model
 
-from hyrfpack.config.edit import CropMasks, CropSphere, Remove, Scale, Translate
-from hyrfpack.edit import plan_edit
+from hyrfpack.config.edit import CropMasks, CropSphere, Refit, Remove, Scale, Translate
+from hyrfpack.data import load_scene
+from hyrfpack.edit import edit_model, plan_edit
 from hyrfpack.edit.masks import share_of_light_in_masks
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import load_model
@@ -158,3 +160,15 @@ def test_a_crop_keeps_at_least_a_sphere_inside_the_object(scene, masks):
     report = plan_edit(DEMO_MODEL_FILE, actions, data=scene, context=QUIET_CONTEXT)
     first, second = (action.gaussians_after for action in report.actions)
     assert second > 0.8 * first
+
+
+@pytest.mark.parametrize("wrap", [lambda crop: crop, Remove, Refit, lambda crop: Refit(Remove(crop))])
+def test_no_picture_replaces_a_mask_that_the_edit_reads(photos, masks, tmp_path, wrap):
+    folder = Path(shutil.copytree(masks, tmp_path / "masks"))
+    mask = next(folder.iterdir())
+    before = mask.read_bytes()
+
+    for call in (plan_edit, partial(edit_model, target=tmp_path / "edited.hyrf")):
+        with pytest.raises(HyrfError, match="the output is an input itself"):
+            call(DEMO_MODEL_FILE, actions=[wrap(CropMasks(str(folder)))], data=load_scene(photos), picture=mask)
+    assert mask.read_bytes() == before

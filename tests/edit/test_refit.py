@@ -122,7 +122,9 @@ def test_a_region_without_gaussians_or_photos_is_refused(scene, model, damaged_f
     hidden = copy.deepcopy(model)
     hidden.gaussians.positions[0] = torch.tensor([0.0, 0.0, 60.0])
     is_selected = np.arange(len(model)) == 0
-    with pytest.raises(HyrfError, match="training photos shows the 1 Gaussian of the region"):
+    with pytest.raises(
+        HyrfError, match="training photos shows the 1 Gaussian of the region in at least 16 pixels; .*larger"
+    ):
         refit_region(hidden, is_selected, scene.train, 1)
 
 

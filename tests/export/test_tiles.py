@@ -18,11 +18,12 @@ import hyrfpack
 from hyrfpack.cameras.capture import Capture
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
+from hyrfpack.export import pipeline
 from hyrfpack.export.tiles import compute_geometric_errors
 from hyrfpack.format.scene_manifest import Chunk, ChunkLevel, Manifest, ScenePart
 from hyrfpack.lod.select import predict_errors
 from hyrfpack.rotations import rotation_matrices
-from hyrfpack.splats.formats import gltf
+from hyrfpack.splats.formats import gltf, spz
 from hyrfpack.splats.splats import Splats
 from tools.safety.make_golden import GOLDEN_PARTS_SCENE_FOLDER
 
@@ -264,3 +265,12 @@ def test_a_level_without_measured_error_replaces_the_finest_one_at_any_distance(
 def test_one_export_writes_one_kind_of_folder(scene, tmp_path):
     with pytest.raises(HyrfError, match="give only one of `streamed_sog=True` and `tiles_3d=True`"):
         hyrfpack.export_model(scene, tmp_path / "out", hyrfpack.ExportConfig(streamed_sog=True, tiles_3d=True))
+
+
+def test_tiles_that_spz_cannot_hold_are_refused_before_the_bake(tmp_path, monkeypatch):
+    monkeypatch.setattr(spz, "MAX_COORDINATE", 0.01)
+    monkeypatch.setattr(pipeline, "bake_levels", None)
+    config = hyrfpack.ExportConfig(tiles_3d=True, tile_content="spz")
+
+    with pytest.raises(HyrfError, match="units from the origin of the tiles.*use `tile_content='gltf'`"):
+        hyrfpack.export_model(GOLDEN_PARTS_SCENE_FOLDER, tmp_path / "tiles", config, context=QUIET_CONTEXT)

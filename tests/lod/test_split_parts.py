@@ -19,7 +19,7 @@ from hyrfpack.config.edit import Rotate, Translate
 from hyrfpack.config.split import SplitConfig
 from hyrfpack.context import RunContext
 from hyrfpack.edit import merge_models
-from hyrfpack.errors import HyrfFormatError
+from hyrfpack.errors import HyrfError, HyrfFormatError
 from hyrfpack.format import describe_file, load_merged_model, load_model, save_model, scene_manifest
 from hyrfpack.format.arrays import to_arrays
 from hyrfpack.format.codec import load_parts, load_with_provenance
@@ -28,7 +28,7 @@ from hyrfpack.lod import LevelRenderer, split, split_model
 from hyrfpack.model.merged import MergedModel
 from hyrfpack.render import render_view
 from tools.safety import minimal_reader
-from tools.safety.make_golden import GOLDEN_FOLDER, GOLDEN_MERGED_FILE, GOLDEN_PARTS_SCENE_FOLDER
+from tools.safety.make_golden import GOLDEN_FOLDER, GOLDEN_MERGED_FILE, GOLDEN_PARTS_SCENE_FOLDER, GOLDEN_SCENE_FOLDER
 
 COMPACT_FILE, RAW_FILE = (GOLDEN_FOLDER / "trained" / name for name in ("demo_compact.hyrf", "demo.hyrf"))
 QUIET_CONTEXT = RunContext(progress=None)
@@ -237,3 +237,19 @@ def test_the_golden_scene_of_several_parts_is_read_as_the_file_that_it_was_made_
         _, groups, _ = minimal_reader.read(others[f"chunk-{number:04d}-0.hyrf"], folder=others)
         for group, values in to_arrays(other).items():
             np.testing.assert_array_equal(values, groups[group], err_msg=group)
+
+
+@pytest.mark.parametrize("in_scene", [True, False], ids=["in its scene", "beside its shared file"])
+def test_a_chunk_is_not_split_into_its_own_folder(tmp_path, in_scene):
+    """The files of the scene, among them the chunk, would be replaced."""
+    folder = Path(shutil.copytree(GOLDEN_PARTS_SCENE_FOLDER, tmp_path / "scene"))
+    if not in_scene:
+        folder = tmp_path / "alone"
+        folder.mkdir()
+        shutil.copy(GOLDEN_SCENE_FOLDER / "chunk-0000-0.hyrf", folder)
+        shutil.copy(GOLDEN_SCENE_FOLDER / "shared.hyrf", folder)
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+
+    with pytest.raises(HyrfError, match="the output is an input itself"):
+        split_model(sorted(folder.glob("chunk*"))[-1], folder, SplitConfig(levels=1, refit_steps=0))
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before

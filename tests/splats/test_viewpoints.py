@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from explicit_balls import ball_splats
 
+from hyrfpack.errors import HyrfDataError
 from hyrfpack.splats import viewpoints as views
 from hyrfpack.splats.draw import Drawable
 from hyrfpack.splats.splats import Splats, concatenate
@@ -89,3 +90,19 @@ def test_sampling_a_quarter_of_the_splats_gives_similar_scores(monkeypatch: pyte
     np.testing.assert_allclose(
         [weighted.estimate_clutter(camera.position, 1.0) for camera in cameras], cluttered, rtol=0.3, atol=0.01
     )
+
+
+@pytest.mark.parametrize(
+    ("splats", "problem"),
+    [
+        (ball_splats(5)[np.zeros(5, bool)], "ball.ply: there is no Gaussian in it"),
+        (replace(ball_splats(5), opacities=np.zeros(5)), "ball.ply: no Gaussian is visible"),
+        (
+            replace(ball_splats(5), positions=np.full((5, 3), 1e9, np.float32), scales=np.full((5, 3), 1e-9)),
+            "ball.ply: all Gaussians lie at one place",
+        ),
+    ],
+)
+def test_splats_that_nothing_can_be_seen_of_are_named(splats: Splats, problem: str) -> None:
+    with pytest.raises(HyrfDataError, match=problem):
+        WeightedSplats.from_splats(splats, "ball.ply")

@@ -158,6 +158,15 @@ def test_dark_sets_and_changing_light_are_reported(photos):
     assert survey.stops > 2.5 and "lock exposure" in find_problem(survey, "in brightness")
 
 
+def test_cut_outs_on_a_transparent_ground_are_not_called_dark(photos):
+    for number in range(24):
+        (photos / f"{number:03d}.jpg").unlink()
+        picture = np.zeros((120, 160, 4), np.uint8)
+        picture[50:70, 60:100] = (*random_rectangles(number)[0, 0] // 2 + 128, 255)
+        Image.fromarray(picture).save(photos / f"{number:03d}.png")
+    assert not any("dark" in sentence for sentence in describe_photos(photos).problems)
+
+
 def test_photos_of_a_single_view_are_detected(photos):
     for number in range(24):
         save_photo(photos / f"{number:03d}.jpg", random_rectangles(1), focal=26)

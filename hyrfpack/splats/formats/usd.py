@@ -47,6 +47,7 @@ _HORIZONTAL_APERTURE = 36.0
 _NEAR_MEDIAN_DEPTH_RATIO = 0.01
 _FAR_MAX_REACH_RATIO = 1.1
 _USDZ_ALIGNMENT_BYTES = 64
+_FLOAT32_MAX = float(np.finfo(np.float32).max)
 _MAX_USDZ_BYTES = (1 << 32) - 1  # because a .usdz is a zip without 64-bit lengths
 
 
@@ -179,8 +180,10 @@ def _compute_extent(positions: np.ndarray, scales: np.ndarray, quats: np.ndarray
     if not len(positions):
         return np.zeros((2, 3), np.float32)
     # The reach of an ellipsoid along an axis is the length of that row of rotation times scales.
+    positions, scales, quats = (values.astype(np.float64) for values in (positions, scales, quats))
     half = 3 * np.linalg.norm(rotation_matrices(quats) * scales[:, None], axis=2)
-    return np.stack(((positions - half).min(axis=0), (positions + half).max(axis=0)))
+    corners = np.stack(((positions - half).min(axis=0), (positions + half).max(axis=0)))
+    return np.clip(corners, -_FLOAT32_MAX, _FLOAT32_MAX).astype(np.float32)
 
 
 def _add_camera(stage: Usd.Stage, camera: Camera, splats: Splats) -> None:

@@ -103,7 +103,6 @@ const lowerHull = (costs, errors, isAvailable) => {
   for (const level of levels.sort((a, b) => costs[a] - costs[b] || errors[a] - errors[b] || a - b)) {
     const last = hull[hull.length - 1];
     if (hull.length && errors[level] >= errors[last]) continue;
-    if (hull.length && costs[level] === costs[last]) hull.pop();
     while (hull.length > 1) {
       const [a, b] = hull.slice(-2), rises = (errors[b] - errors[a]) * (costs[level] - costs[a]);
       if (rises < (errors[level] - errors[a]) * (costs[b] - costs[a])) break;

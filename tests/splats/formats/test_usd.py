@@ -104,6 +104,14 @@ def test_the_extent_is_the_bounding_box_at_three_sigma(pxr, tmp_path):
     assert (surface >= low - 1e-6).all() and (surface <= high + 1e-6).all()
 
 
+def test_the_extent_of_huge_splats_is_finite(pxr, tmp_path):
+    splats = replace(random_splats(3), scales=np.full((3, 3), 1e28, np.float32))
+    with np.errstate(all="raise"):
+        stage = write_and_open_stage(pxr, tmp_path, splats, Hints())
+    prims = [prim for prim in stage.Traverse() if prim.GetAttribute("extent")]
+    assert np.isfinite(np.array(prims[0].GetAttribute("extent").Get())).all()
+
+
 def test_the_camera_projects_as_opencv_does(pxr, tmp_path):
     splats = random_splats(20)
     up = np.array([0.1, -0.7, 0.2]) / np.sqrt(0.54)
