@@ -23,7 +23,9 @@ def open_cache_folder(name: str) -> Path:
     default_caches = {"darwin": f"{home}/Library/Caches", "win32": os.environ.get("LOCALAPPDATA", home)}
     caches = os.environ.get("XDG_CACHE_HOME") or default_caches.get(sys.platform, f"{home}/.cache")
     user = os.getuid() if hasattr(os, "getuid") else "user"
-    for own_folder in (Path(caches, "hyrfpack"), Path(tempfile.gettempdir(), f"hyrfpack-{user}")):
+    # Without a known home, expanduser returns "~", which would be a folder in the working directory.
+    homes = [Path(caches, "hyrfpack")] if os.path.isabs(caches) else []
+    for own_folder in (*homes, Path(tempfile.gettempdir(), f"hyrfpack-{user}")):
         folder = own_folder / name
         try:
             own_folder.mkdir(mode=0o700, parents=True, exist_ok=True)

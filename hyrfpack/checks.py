@@ -40,6 +40,17 @@ def check_float(name: str, value: Any, minimum: float = 0.0, maximum: float = MA
     raise ValueError(f"{name} is {value!r}; it must be a number {allowed}")
 
 
+def check_finite(name: str, value: Any) -> None:
+    """Check that a value is a float or an int, not a bool, and finite.
+
+    Raises:
+        ValueError: the check fails.
+    """
+    if isinstance(value, float | int) and not isinstance(value, bool) and abs(value) <= MAX_FLOAT:
+        return
+    raise ValueError(f"{name} is {value!r}; it must be a finite number")
+
+
 def check_positive(name: str, value: Any) -> None:
     """Check that a value is a float or an int, not a bool, finite and above 0.
 

@@ -91,6 +91,11 @@ class Camera:
             raise ValueError(f"a camera of {self.width} x {self.height} pixels; each side needs at least one")
         if not (np.isfinite(self.intrinsics).all() and self.fx > 0 and self.fy > 0):
             raise ValueError(f"the intrinsics {self.intrinsics} must be finite, the focal lengths positive")
+        # Numbers of NumPy are converted, because they cannot be written as JSON and small integers overflow.
+        for name in ("width", "height"):
+            object.__setattr__(self, name, int(getattr(self, name)))
+        for name in ("fx", "fy", "cx", "cy"):
+            object.__setattr__(self, name, float(getattr(self, name)))
         try:
             object.__setattr__(self, "camera_from_world", rigid_pose(self.camera_from_world))
         except ValueError as error:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 from commands import succeeded
 from numba.core.caching import CompileResultCacheImpl
+
+from hyrfpack.cache_folder import open_cache_folder
 
 COMPACT_GOLDEN_FILE = Path(__file__).parent / "golden" / "v1.1_compact.hyrf"
 CACHE_FOLDER_VARIABLES = ("MPLCONFIGDIR", "XDG_CACHE_HOME", "XDG_CONFIG_HOME")
@@ -39,3 +42,16 @@ def test_the_library_prints_no_note_about_the_cache(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "curve.png").is_file()
+
+
+@pytest.mark.parametrize("home", ["~", "relative/caches"])
+def test_without_a_known_home_the_cache_is_in_the_temporary_folder(home, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os.path, "expanduser", lambda _: home)
+    monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path / "temporary"))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+
+    folder = open_cache_folder("archives")
+
+    assert folder.parent.parent == tmp_path / "temporary"
+    assert [path.name for path in tmp_path.iterdir()] == ["temporary"]

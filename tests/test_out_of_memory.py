@@ -93,3 +93,12 @@ def test_a_render_names_the_size_of_the_picture(monkeypatch):
 def test_a_command_ends_with_the_sentence(monkeypatch):
     monkeypatch.setattr("hyrfpack.doctor.diagnose_machine", fail)
     assert "the GPU's memory ran out" in refused("doctor") and "--device cpu" in refused("doctor")
+
+
+def test_a_command_advises_another_device_only_if_a_gpu_lacks_memory(monkeypatch):
+    def fail_on_cpu(*_: object, **__: object) -> None:
+        raise MemoryError("Unable to allocate 40. GiB")
+
+    monkeypatch.setattr("hyrfpack.doctor.diagnose_machine", fail_on_cpu)
+    message = refused("doctor")
+    assert "memory ran out" in message and "use smaller photos" in message and "--device" not in message

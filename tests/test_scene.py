@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 from scenes import ball_scene, camera_at, look_at, view_of
 
+from hyrfpack.cameras.files import camera_from_json, camera_to_json
 from hyrfpack.scene import Camera, Picture, Scene, View
 
 
@@ -29,7 +31,12 @@ def test_camera_intrinsics_have_the_order_fx_fy_cx_cy():
 def test_a_picture_size_that_is_no_integer_is_rejected(size):
     with pytest.raises(ValueError, match="both must be integers"):
         Camera(*size, 1.0, 2.0, 3.0, 4.0, np.eye(4))
-    assert Camera(np.int64(16), np.uint16(9), 1.0, 2.0, 3.0, 4.0, np.eye(4)).height == 9
+
+
+def test_a_camera_of_numpy_numbers_is_written_as_json():
+    camera = Camera(np.int64(160), np.uint8(250), np.float32(1.5), 2, np.float64(3), np.float16(4), np.eye(4))
+    assert camera.height * camera.height == 62500
+    assert camera_from_json(json.loads(json.dumps(camera_to_json(camera)))) == camera
 
 
 def test_project_agrees_with_the_pinhole_equation_and_marks_points_behind():

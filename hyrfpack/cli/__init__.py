@@ -48,7 +48,7 @@ from hyrfpack.cli.view import view
 from hyrfpack.cli.wording import use_option_names
 from hyrfpack.errors import HyrfError, needs_package, printable
 from hyrfpack.kernel_errors import KERNEL_ERROR_FIX, describe_kernel_error
-from hyrfpack.out_of_memory import describe_out_of_memory
+from hyrfpack.out_of_memory import GPU_PROBLEM, describe_out_of_memory
 from hyrfpack.version import __version__
 
 # Errors of the system at any path of a user, such as one in a folder without access.
@@ -101,7 +101,8 @@ class _CommandGroup(click.Group):
 def _explain_error(error: Exception) -> str | None:
     """Return the message for an error that is not a HyrfError but that a user can correct; None for a bug."""
     if (problem := describe_out_of_memory(error)) is not None:
-        return f"{problem}; use smaller photos, pictures or models, or --device cpu"
+        remedy = ", or --device cpu" if problem.startswith(GPU_PROBLEM) else ""
+        return f"{problem}; use smaller photos, pictures or models{remedy}"
     if (problem := describe_kernel_error(error)) is not None:
         return f"{problem}; {KERNEL_ERROR_FIX}"
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):

@@ -100,7 +100,7 @@ def bench(
     folder = None if model is None else find_input_folder(model)
     outputs = Outputs(model, folders=[folder], scene=scene, overwrite=overwrite)
     outputs.file(output)
-    page = _read_page(markdown)
+    page, _ = _read_page(markdown)
     if page:  # check before minutes of work that the page has a place for each table
         tables.fill_page(page, dict.fromkeys(("machine", *(only or BENCH_GROUPS)), ""), str(markdown))
     if markdown is not None:  # an existing page with places is filled, which needs no permission to overwrite
@@ -118,16 +118,19 @@ def bench(
     note(f"{note_rename(output, plot(result.rows, output, overwrite=overwrite))}: time against error")
     if markdown is not None:
         blocks = tables.format_markdown(result)
-        page = page and _read_page(markdown)  # read again, because it may have been edited during the measurements
-        filled = tables.fill_page(page or tables.empty_page(blocks), blocks, str(markdown)).encode()
-        note_rename(markdown, write_atomic(markdown, filled, overwrite=overwrite or bool(page)))
+        # It is read again, because it may have been edited during the measurements.
+        page, line_end = _read_page(markdown) if page else ("", "\n")
+        filled = tables.fill_page(page or tables.empty_page(blocks), blocks, str(markdown))
+        content = filled.replace("\n", line_end).encode()
+        note_rename(markdown, write_atomic(markdown, content, overwrite=overwrite or bool(page)))
 
 
-def _read_page(path: Path | None) -> str:
-    """Return the text of a Markdown file, or "" if there is none."""
+def _read_page(path: Path | None) -> tuple[str, str]:
+    """Return the text of a Markdown file, whose lines end with "\\n", and the end of its lines; "" without a file."""
     if path is None or not path.exists():
-        return ""
+        return "", "\n"
     try:
-        return path.read_text(encoding="utf-8")
+        text = path.read_bytes().decode("utf-8")
+        return text.replace("\r\n", "\n"), "\r\n" if "\r\n" in text else "\n"
     except (OSError, ValueError) as error:
         raise HyrfError(f"{path}: the page cannot be read ({error})", fix="name another with --markdown") from error

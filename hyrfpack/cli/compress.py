@@ -109,8 +109,10 @@ def compress(
         outputs.file(output, ".hyrf")
         if report is not None:
             from hyrfpack.evaluate.figures import require_matplotlib
+            from hyrfpack.report.compression import check_single_model
 
             require_matplotlib()
+            check_single_model(model)
             outputs.folder(report, REPORT_FILES)
         return scene
 

@@ -83,13 +83,14 @@ def is_verbose() -> bool:
 def note(sentence: str) -> None:
     """Print a sentence on standard error; with --verbose, the seconds since the start precede it.
 
-    Python arguments that the sentence names become options, see `use_option_names`.
+    Python arguments that the sentence names become options, see `use_option_names`. Unprintable characters become
+    escapes.
     """
     sentence = use_option_names(sentence)
     if is_verbose():
         sentence = f"[{time.perf_counter() - click.get_current_context().meta[_START_TIME_KEY]:7.2f} s] {sentence}"
     with suppress(OSError, ValueError):  # a full disk or a closed stream must not end the work
-        click.echo(sentence, err=True)
+        click.echo(printable(sentence), err=True)
 
 
 def print_line(line: str) -> None:

@@ -117,6 +117,8 @@ def _read_cameras(path: Path) -> tuple[list[Camera], Scene | None]:
 
     if path.is_dir() or is_archive(path):
         scene = load_scene(path)
+        for sentence in scene.notes:
+            note(sentence)
         return [view.camera for view in scene.views], scene
     return [camera for _, camera in cameras_from_json(path)], None
 

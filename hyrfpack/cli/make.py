@@ -142,5 +142,9 @@ def _viewing_hint(result: MakeResult) -> str:
         return "open it in a browser"
     if output.is_dir():
         return f"for any web server; see it with {suggest_command('view', result.model)}"
-    viewable = output.suffix.lower() in (".hyrf", ".ply", ".splat", ".spz", ".sog") and ".points." not in output.name
+    from hyrfpack.export.kinds import find_kind_by_ending
+    from hyrfpack.splats.names import SPLATS_SUFFIXES
+
+    kind = find_kind_by_ending(output)
+    viewable = output.suffix.lower() == ".hyrf" or (kind is not None and kind.ending in SPLATS_SUFFIXES)
     return f"see it with {suggest_command('view', output if viewable else result.model)}"

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-from hyrfpack.checks import check_float, check_int, check_positive
+from hyrfpack.checks import check_finite, check_float, check_int, check_positive
 from hyrfpack.config.settings import Range, check_settings
 from hyrfpack.counts import format_count
 
@@ -48,7 +48,7 @@ class CropBox:
     degrees: float = 0.0
 
     def __post_init__(self) -> None:
-        check_float("degrees", abs(self.degrees))
+        check_finite("degrees", self.degrees)
         if self.degrees and not all(map(math.isfinite, (*self.low, *self.high))):
             raise ValueError(f"the box from {self.low} to {self.high} has no centre, about which it could be turned")
         for name in ("low", "high"):
@@ -337,7 +337,7 @@ class Rotate:
 
     def __post_init__(self) -> None:
         _check_direction("axis", self.axis)
-        check_float("degrees", abs(self.degrees))
+        check_finite("degrees", self.degrees)
 
     def __str__(self) -> str:
         return f"rotate by {self.degrees:g} degrees about {_format(self.axis)}"

@@ -132,7 +132,7 @@ def _choose_model(path: Path, models: Sequence[Path], name: str | None) -> tuple
     sizes = {model: _count_registered_photos(model) for model in models}
     listed = ", ".join(f"{model.name} ({format_count(size, 'photo')})" for model, size in sizes.items())
     chosen = max(models, key=lambda model: sizes[model])  # max returns the first of several models of the same size
-    reason = "because it has the most photos; select another with `model`"
+    reason = "because it has the most photos; 'hyrfpack train' selects another with `model`"
     if name is not None:
         named = [model for model in models if model.name == name]
         if not named:

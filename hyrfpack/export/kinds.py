@@ -126,9 +126,13 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
     _check_mesh_settings(kind, target, config)
     _check_page_settings(kind, target, config)
     check_package(kind, target)
+    if kind.ending == ".mesh.glb":
+        with needs_package(f"{target}: writing this file"):
+            import_module("trimesh")
     if config.faces is not None or kind in COLLISION_FILES:
         with needs_package(f"{target}: reducing the triangles of a mesh"):
             import_module("fast_simplification")
+            import_module("trimesh")
 
 
 def _check_content_settings(kind: FileKind, target: str | os.PathLike[str], config: ExportConfig) -> None:

@@ -43,7 +43,7 @@ def reduce_faces(vertices: np.ndarray, faces: np.ndarray, count: int) -> tuple[n
     """Reduce a mesh to about `count` triangles by collapsing the edges of least quadric error (Garland, Heckbert 1997).
 
     Raises:
-        HyrfError: fast-simplification is missing.
+        HyrfError: fast-simplification or trimesh is missing.
     """
     if len(faces) <= count:
         return vertices, faces

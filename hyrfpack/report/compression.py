@@ -19,6 +19,7 @@ from hyrfpack.cameras.capture import Capture, place_photos
 from hyrfpack.compress import CompressionReport
 from hyrfpack.compress.calibrate import measure_calibrated_sensitivity
 from hyrfpack.compress.distortion import DISTORTION_RANGE, default_distortion
+from hyrfpack.compress.merged import is_merged
 from hyrfpack.compress.quantize import plan_and_quantize
 from hyrfpack.compress.sensitivity import Sensitivity
 from hyrfpack.counts import format_count
@@ -98,15 +99,25 @@ def write_compression_report(
         The path of the page. It is written last, so if it exists, all pictures that it shows exist.
 
     Raises:
-        HyrfError: a file cannot be read, the folder cannot be written, another call is writing into it, or matplotlib
-            is missing.
+        HyrfError: a file cannot be read or holds merged models, the folder cannot be written, another call is writing
+            into it, or matplotlib is missing.
     """
     require_matplotlib()
+    check_single_model(source)
     folder, source, packed = Path(folder), Path(source), Path(packed)
     Outputs(source, packed, scene=scene, overwrite=True).folder(folder, REPORT_FILES)
     with exclusive_folder(folder, "another folder with `report`"):
         Outputs(source, packed, scene=scene, overwrite=overwrite).folder(folder, REPORT_FILES)
         return _write_report(folder, source, packed, report, scene, command, overwrite)
+
+
+def check_single_model(source: str | os.PathLike[str]) -> None:
+    """Raise HyrfError if a file holds merged models, for which there is no report."""
+    if is_merged(Path(source)):
+        raise HyrfError(
+            f"{source}: this file holds merged models, and a report compares versions of one model",
+            fix="leave out `report`, or compress the models before they are merged",
+        )
 
 
 def _write_report(

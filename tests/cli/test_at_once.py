@@ -203,7 +203,8 @@ def test_bench_keeps_files_that_appear_meanwhile_and_updates_the_current_page(wo
     Path("page.md").write_text(words.empty_page({"machine": "", "codec": ""}))
 
     def edited_meanwhile(*arguments, **options):
-        Path("page.md").write_text(f"A new line.\n{Path('page.md').read_text()}")
+        text = f"A new line.\n{Path('page.md').read_text()}"
+        Path("page.md").write_bytes(text.replace("\n", "\r\n").encode())  # as an editor on Windows may save it
         Path("out.png").write_bytes(FOREIGN_BYTES)
         return measure(*arguments, **options)
 
@@ -214,8 +215,9 @@ def test_bench_keeps_files_that_appear_meanwhile_and_updates_the_current_page(wo
 
     assert Path("out.png").read_bytes() == FOREIGN_BYTES
     assert "out-2.png: time against error" in result.stderr
-    page = Path("page.md").read_text()
-    assert page.startswith("A new line.\n") and "| raw |" in page.replace("`", "")
+    page = Path("page.md").read_bytes().decode()
+    assert page.startswith("A new line.\r\n") and "| raw |" in page.replace("`", "")
+    assert page.count("\n") == page.count("\r\n")
 
 
 def test_a_log_that_appears_meanwhile_is_kept(working_folder, monkeypatch):

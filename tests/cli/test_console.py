@@ -172,6 +172,11 @@ def test_messages_of_the_library_are_notes_that_name_options(model):
     assert all(f" s] {sentence}\n" in verbose for sentence in printed)
 
 
+def test_notes_show_control_characters_of_file_names_as_escapes(model, monkeypatch):
+    monkeypatch.setattr("hyrfpack.format.describe_file", lambda path: note("x\x1b]0;title\x07\nError: forged") or {})
+    assert hyrfpack("info", model).stderr.splitlines()[0] == r"x\x1b]0;title\x07\nError: forged"
+
+
 @pytest.mark.usefixtures("describe_with_messages")
 @pytest.mark.parametrize("exists", [True, False])
 def test_a_command_leaves_the_loggers_as_they_were(exists, model, tmp_path, capsys):

@@ -9,6 +9,7 @@ from commands import refused, succeeded
 from explicit_balls import ball_splats
 
 from hyrfpack.cameras.files import cameras_to_json
+from hyrfpack.data import load_scene
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.imports import pack
 from hyrfpack.splats.draw import Drawable
@@ -60,6 +61,13 @@ def test_cameras_can_come_from_a_set_of_photos(source: Path, tmp_path: Path) -> 
     result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK_OPTIONS, "--cameras", photos, "--json")
     assert json.loads(result.stdout)["views"] == 2
     assert "8 given viewpoints" in result.stderr
+
+
+def test_notes_on_the_photos_of_cameras_are_printed(source: Path, tmp_path: Path) -> None:
+    photos = write_demo_scene(tmp_path / "photos", views=10, size=24)
+    next((photos / "images").iterdir()).unlink()
+    result = succeeded("import", source, "-o", tmp_path / "x.hyrf", *QUICK_OPTIONS, "--cameras", photos)
+    assert any(sentence in result.stderr for sentence in load_scene(photos).notes)
 
 
 @pytest.mark.parametrize("place", ["x.hyrf", "images/x.hyrf"])

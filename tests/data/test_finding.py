@@ -134,7 +134,9 @@ def test_the_model_with_the_most_photos_is_used_and_noted(tmp_path, colmap_folde
     assert len(scene.views) == sizes[taken]
     (note,) = [note for note in scene.notes if "COLMAP models" in note]
     assert note.startswith(f"there are {len(sizes)} COLMAP models: ")
-    assert note.endswith(f"; {taken} is used, because it has the most photos; select another with `model`")
+    assert note.endswith(
+        f"; {taken} is used, because it has the most photos; 'hyrfpack train' selects another with `model`"
+    )
     assert all(f"{name} ({count} photos)" in note for name, count in sizes.items())
     assert all("sparse" not in file or f"sparse/{taken}/" in file for file in scene.files)
 

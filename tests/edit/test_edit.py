@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -445,3 +447,11 @@ def test_a_chunk_of_a_scene_folder_keeps_the_provenance_of_the_scene(tmp_path):
     report = edit_model(chunk, tmp_path / "edited.hyrf", [Translate((1.0, 0.0, 0.0))], context=QUIET_CONTEXT)
     before, after = (describe_file(path)["provenance"] for path in (chunk, report.file))
     assert after.keys() == before.keys() | {"placement"}
+
+
+@pytest.mark.parametrize("degrees", [math.nan, math.inf, True, "9"])
+def test_an_angle_that_is_no_finite_number_is_refused(degrees):
+    for make in (partial(Rotate, (0.0, 0.0, 1.0)), partial(CropBox, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))):
+        with pytest.raises(ValueError, match="degrees is .*; it must be a finite number"):
+            make(degrees=degrees)
+    assert Rotate((0.0, 0.0, 1.0), -90.0).degrees == -90

@@ -555,6 +555,13 @@ def test_missing_packages_are_reported_before_the_bake(
         export(plain_file, tmp_path / f"a{ending}", colmap=not ending)
 
 
+@pytest.mark.parametrize("name", ["a.mesh.glb", "a.collision.obj"])
+def test_a_mesh_that_needs_trimesh_is_refused_before_depths_are_rendered(name, plain_file, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(HyrfError, match="pip install trimesh'$"):
+        hyrfpack.export_model(plain_file, tmp_path / name)
+
+
 @pytest.mark.parametrize("failing", ["encode", "decode", "make_background_splats"])
 def test_a_failed_export_keeps_the_old_file(failing, sphere_file, tmp_path, monkeypatch):
     def fail(*arguments, **options):

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import zipfile
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -15,6 +16,7 @@ from explicit_balls import ball_splats
 from PIL import Image
 
 from hyrfpack import load_model, load_scene
+from hyrfpack.cli.make import _viewing_hint
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.config.train import TrainConfig
 from hyrfpack.context import RunContext
@@ -637,3 +639,12 @@ def test_training_estimates_poses_once_with_the_option(photos, poses, tmp_path):
 def test_a_run_among_photos_without_poses_is_rejected(photos, poses, tmp_path):
     assert "among the photos" in refused("train", photos, "-o", photos / "run", "--poses")
     assert not poses
+
+
+@pytest.mark.parametrize(
+    ("name", "is_viewable"),
+    [("a.hyrf", True), ("a.PLY", True), ("a.mesh.ply", False), ("a.POINTS.ply", False), ("a.usdz", False)],
+)
+def test_the_hint_names_a_file_that_the_player_can_show(name, is_viewable):
+    result = SimpleNamespace(output=Path(name), model=Path("a.work/packed.hyrf"))
+    assert _viewing_hint(result) == f"see it with 'hyrfpack view {name if is_viewable else 'a.work/packed.hyrf'}'"

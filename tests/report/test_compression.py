@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from commands import succeeded
+from commands import refused, succeeded
 from PIL import Image
 from scenes import ball_points, ball_scene, ring, small_model
 
@@ -25,6 +25,7 @@ from hyrfpack.report.compression import choose_amplification, write_compression_
 from hyrfpack.report.compression_page import format_size
 from hyrfpack.scene import Scene
 from tools.browser import chromium, firefox
+from tools.safety.make_golden import GOLDEN_MERGED_FILE
 
 pytestmark = pytest.mark.usefixtures("quick_calibration")
 NAME_WITH_MARKUP = "<script>alert(1)</script>&amp;.png"
@@ -351,3 +352,9 @@ def test_formatted_sizes_have_three_digits(count, words):
 @pytest.mark.parametrize(("between", "times"), [(100.0, 64), (40.0, 32), (30.0, 8), (6.0, 1), (0.0, 1)])
 def test_amplification_makes_the_worst_difference_visible(between, times):
     assert choose_amplification(between) == times
+
+
+def test_a_report_on_merged_models_is_refused_before_they_are_compressed(tmp_path):
+    message = refused("compress", GOLDEN_MERGED_FILE, "-o", tmp_path / "a.hyrf", "--report", tmp_path / "page")
+    assert "holds merged models, and a report compares versions of one model; leave out --report" in message
+    assert list(tmp_path.iterdir()) == []
