@@ -25,7 +25,7 @@ from hyrfpack.compress.planner import Planner
 from hyrfpack.compress.reference_renders import ReferenceRenders
 from hyrfpack.compress.sensitivity import TARGET_DRAWN_GAUSSIANS, Sensitivity, measure_sensitivity
 from hyrfpack.model import Decoded, HybridModel
-from hyrfpack.parallel.pool import torch_on_one_thread
+from hyrfpack.parallel.pool import return_freed_memory, torch_on_one_thread
 from hyrfpack.progress import Progress, TaskEvent, ignore_progress, part_of_progress, round_of_progress
 from hyrfpack.scene import Camera
 
@@ -101,6 +101,7 @@ def calibrate(
     """
     if not sensitivity.is_seen:
         return sensitivity
+    return_freed_memory()
     outputs = model.geometry_outputs() if outputs is None else outputs
     geometry = model.geometry_from_outputs(outputs)
     # Pruning is calibrated first, because the errors of the other parts depend on which Gaussians are left.

@@ -34,7 +34,7 @@ from hyrfpack.format.sections import (
     TABLE_SECTIONS,
 )
 from hyrfpack.model import Decoded, Geometry, HybridModel
-from hyrfpack.parallel.pool import run_jobs
+from hyrfpack.parallel.pool import return_freed_memory, run_jobs
 from hyrfpack.progress import Progress, TaskEvent
 
 # The sections that are quantised and compared together. A decoder has so few numbers that its error depends on chance,
@@ -144,6 +144,8 @@ class QuantizationErrors:
         quantized = quantize(planned.model, planned.plan, sensitivity, sections=names, field_logits=field_logits)
         by_section = _predict_quantization_errors(planned.model, quantized, sensitivity, field_logits)
         arrays = _undo_plan_order(quantized)
+        del quantized  # Its symbols take memory, and only their values are rendered.
+        return_freed_memory()
         errors = {}
         for number, part in enumerate(parts):
             contents = " and ".join(SECTION_CONTENTS[name] for name in part)

@@ -205,6 +205,28 @@ print(kept, resident_bytes() - before)
 """
 
 
+GAPS_SCRIPT = """
+import os
+from hyrfpack.parallel.pool import return_freed_memory
+
+def resident_bytes():
+    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+blocks = [bytearray(100_000) for _ in range(2000)]  # 200 MB
+del blocks[::2]  # blocks between others are not returned when they are freed
+before = resident_bytes()
+return_freed_memory()
+print(before - resident_bytes())
+"""
+
+
+@pytest.mark.acceptance
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs glibc")
+def test_freed_memory_between_blocks_is_returned() -> None:
+    result = subprocess.run([sys.executable, "-c", GAPS_SCRIPT], capture_output=True, text=True, check=True)
+    assert int(result.stdout) > 50e6
+
+
 @pytest.mark.acceptance
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="needs glibc")
 def test_freed_memory_is_kept_for_the_block_only() -> None:
