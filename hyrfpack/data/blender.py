@@ -7,9 +7,7 @@ from pathlib import Path, PurePosixPath
 from hyrfpack.data.assemble import PosedPhoto, assemble_scene, missing_photos_notes
 from hyrfpack.data.names import PictureIndex
 from hyrfpack.data.pictures import read_header
-from hyrfpack.data.transforms import finite_number, focal_from_angle, pose_from_opengl, read_transforms
-from hyrfpack.data.undistort import Lens
-from hyrfpack.errors import HyrfDataError
+from hyrfpack.data.transforms import frame_lens, pose_from_opengl, read_transforms
 from hyrfpack.scene import Scene
 
 
@@ -52,9 +50,6 @@ def _read_split(path: Path, split: str, notes: list[str]) -> list[PosedPhoto]:
     """Read the photos of one transforms file."""
     file = path / f"transforms_{split}.json"
     content = read_transforms(file)
-    angle = finite_number(content, "camera_angle_x", file)
-    if angle is None:
-        raise HyrfDataError(f"{file}: has no 'camera_angle_x', so the focal length is unknown", fix="add it")
     photos: list[PosedPhoto] = []
     missing: list[str] = []
     index = PictureIndex(path)
@@ -65,8 +60,7 @@ def _read_split(path: Path, split: str, notes: list[str]) -> list[PosedPhoto]:
             missing.append(str(PurePosixPath(frame["file_path"])))
             continue
         header = read_header(picture)
-        focal = focal_from_angle(angle, header.width, file, "camera_angle_x")
-        lens = Lens(header.width, header.height, focal, focal, header.width / 2, header.height / 2)
+        lens = frame_lens(content, frame, header, file)
         name = index.photo_name(picture, frame["file_path"])
         photos.append(PosedPhoto(name, picture, header, lens, pose_from_opengl(frame, file)))
     notes += matches.notes

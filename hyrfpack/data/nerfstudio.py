@@ -8,30 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from hyrfpack.cameras.files import focal_entries, focal_lengths
+from hyrfpack.cameras.files import focal_entries
 from hyrfpack.data.assemble import PosedPhoto, assemble_scene, missing_photos_notes
 from hyrfpack.data.equirectangular import panorama_lens
 from hyrfpack.data.masks import find_mask_folder
 from hyrfpack.data.names import NameMatches, PictureIndex, path_parts, safe_name
-from hyrfpack.data.pictures import PictureHeader, read_header
+from hyrfpack.data.pictures import read_header
 from hyrfpack.data.points import read_ply_points
 from hyrfpack.data.search import find_photo_folder
 from hyrfpack.data.sidecar_files import find_picture_folder
-from hyrfpack.data.transforms import (
-    finite_number,
-    focal_from_angle,
-    pose_from_opengl,
-    read_transforms,
-    with_forward_slashes,
-)
-from hyrfpack.data.undistort import Lens, brown_coefficients
+from hyrfpack.data.transforms import frame_lens, pose_from_opengl, read_transforms, with_forward_slashes
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Scene
 
-_PERSPECTIVE_MODELS = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
-_FISHEYE_MODELS = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
 _PANORAMA_MODEL = "EQUIRECTANGULAR"
-_DENOMINATOR_KEYS = ("k4", "k5", "k6")
 
 
 def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size: int) -> Scene:
@@ -82,7 +72,7 @@ def read_nerfstudio(path: Path, *, test_every: int, images: str | None, max_size
         else:
             if is_moved:
                 _check_scale_is_known(content, frame, file)
-            lens = _lens(content, frame, header, file)
+            lens = frame_lens(content, frame, header, file)
         mask = _listed_mask(masks, frame, name, file)
         photos.append(PosedPhoto(name, picture, header, lens, pose_from_opengl(frame, file), mask))
     notes += matches.notes
@@ -189,46 +179,6 @@ def _check_scale_is_known(content: dict[str, Any], frame: dict[str, Any], file: 
             f"{file}: there is no 'w' and 'h', so that focal lengths cannot be scaled to the photos of another folder",
             fix="add the width and height of the calibration",
         )
-
-
-def _lens(content: dict[str, Any], frame: dict[str, Any], header: PictureHeader, file: Path) -> Lens:
-    """Return the lens of a frame, from the frame's own intrinsics or otherwise from those of the file."""
-
-    def value(key: str) -> float | None:
-        own = finite_number(frame, key, file)
-        return own if own is not None else finite_number(content, key, file)
-
-    where = f"{file}: frame {frame['file_path'][:80]}"
-    width, height = int(value("w") or header.width), int(value("h") or header.height)
-    stated = focal_entries(frame, content)
-    entries = {key: number for key in stated if (number := finite_number(stated, key, file)) is not None}
-    sides = {"camera_angle_x": width, "camera_angle_y": height}
-    focal = focal_lengths(entries, lambda key: focal_from_angle(entries[key], sides[key], file, key))
-    if focal is None:
-        raise HyrfDataError(f"{where} has neither 'fl_x' nor 'camera_angle_x'", fix="add its focal length")
-    fx, fy = focal
-    cx, cy = value("cx"), value("cy")
-    pinhole = (width, height, fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-
-    model = frame.get("camera_model", content.get("camera_model", "OPENCV"))
-    if frame.get("is_fisheye", content.get("is_fisheye", False)):
-        model = "OPENCV_FISHEYE"
-    k1, k2, k3, k4, k5, k6, p1, p2 = (value(key) or 0.0 for key in ("k1", "k2", "k3", *_DENOMINATOR_KEYS, "p1", "p2"))
-    if model in _FISHEYE_MODELS:
-        return Lens(*pinhole, "fisheye", (k1, k2, k3, k4))
-    if model not in _PERSPECTIVE_MODELS:
-        raise HyrfDataError(
-            f"{where} has camera model {str(model)[:40]!r}, which is not supported",
-            fix="undistort the photos first",
-        )
-    if model in ("PINHOLE", "SIMPLE_PINHOLE"):
-        return Lens(*pinhole)
-    if model != "FULL_OPENCV" and (k4 or k5 or k6):
-        raise HyrfDataError(
-            f"{where} has 'k4' or more, which camera model {model} does not define",
-            fix="use camera model FULL_OPENCV (rational) or OPENCV_FISHEYE, or set it to 0",
-        )
-    return Lens(*pinhole, "brown", brown_coefficients(k1, k2, p1, p2, k3, k4, k5, k6))
 
 
 def _listed_mask(masks: PictureIndex, frame: dict[str, Any], name: str, file: Path) -> Path | None:

@@ -1,4 +1,4 @@
-"""Read JSON files of poses and their numbers, and convert poses from OpenGL axes; shared by several readers."""
+"""Read JSON files of poses, their numbers and lenses, and convert poses from OpenGL axes; shared by several readers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from hyrfpack.cameras.files import focal_entries, focal_lengths
+from hyrfpack.data.pictures import PictureHeader
+from hyrfpack.data.undistort import Lens, brown_coefficients
 from hyrfpack.errors import HyrfDataError
+
+_PERSPECTIVE_MODELS = ("OPENCV", "FULL_OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_FISHEYE_MODELS = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
+_DENOMINATOR_KEYS = ("k4", "k5", "k6")
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
@@ -90,6 +97,52 @@ def focal_from_angle(angle: float, size: int, path: Path, key: str) -> float:
             fix=f"correct '{key}'",
         )
     return 0.5 * size / math.tan(0.5 * angle)
+
+
+def frame_lens(content: dict[str, Any], frame: dict[str, Any], header: PictureHeader, file: Path) -> Lens:
+    """Return the lens of a frame, from the frame's own intrinsics or otherwise from those of the file.
+
+    Without a stated size, principal point or distortion, the lens has the size of the picture, its centre and none.
+
+    Raises:
+        HyrfDataError: there is no focal length, a number is not usable, or the camera model is not supported.
+    """
+
+    def value(key: str) -> float | None:
+        own = finite_number(frame, key, file)
+        return own if own is not None else finite_number(content, key, file)
+
+    where = f"{file}: frame {frame['file_path'][:80]}"
+    width, height = int(value("w") or header.width), int(value("h") or header.height)
+    stated = focal_entries(frame, content)
+    entries = {key: number for key in stated if (number := finite_number(stated, key, file)) is not None}
+    sides = {"camera_angle_x": width, "camera_angle_y": height}
+    focal = focal_lengths(entries, lambda key: focal_from_angle(entries[key], sides[key], file, key))
+    if focal is None:
+        raise HyrfDataError(f"{where} has neither 'fl_x' nor 'camera_angle_x'", fix="add its focal length")
+    fx, fy = focal
+    cx, cy = value("cx"), value("cy")
+    pinhole = (width, height, fx, fy, width / 2 if cx is None else cx, height / 2 if cy is None else cy)
+
+    model = frame.get("camera_model", content.get("camera_model", "OPENCV"))
+    if frame.get("is_fisheye", content.get("is_fisheye", False)):
+        model = "OPENCV_FISHEYE"
+    k1, k2, k3, k4, k5, k6, p1, p2 = (value(key) or 0.0 for key in ("k1", "k2", "k3", *_DENOMINATOR_KEYS, "p1", "p2"))
+    if model in _FISHEYE_MODELS:
+        return Lens(*pinhole, "fisheye", (k1, k2, k3, k4))
+    if model not in _PERSPECTIVE_MODELS:
+        raise HyrfDataError(
+            f"{where} has camera model {str(model)[:40]!r}, which is not supported",
+            fix="undistort the photos first",
+        )
+    if model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return Lens(*pinhole)
+    if model != "FULL_OPENCV" and (k4 or k5 or k6):
+        raise HyrfDataError(
+            f"{where} has 'k4' or more, which camera model {model} does not define",
+            fix="use camera model FULL_OPENCV (rational) or OPENCV_FISHEYE, or set it to 0",
+        )
+    return Lens(*pinhole, "brown", brown_coefficients(k1, k2, p1, p2, k3, k4, k5, k6))
 
 
 def pose_from_opengl(frame: dict[str, Any], path: Path) -> np.ndarray:

@@ -18,6 +18,7 @@ from hyrfpack.cameras.capture import PSNR_BEFORE_COMPRESSION, PSNR_BEFORE_EDIT, 
 from hyrfpack.cameras.paths import Viewpoint
 from hyrfpack.checks import check_several, check_type
 from hyrfpack.counts import format_count
+from hyrfpack.errors import HyrfError
 from hyrfpack.evaluate import evaluate_model
 from hyrfpack.evaluate.metrics import IDENTICAL_PSNR
 from hyrfpack.export.pages import choose_page_cameras, suggest_compression
@@ -40,6 +41,7 @@ from hyrfpack.outputs import Outputs
 from hyrfpack.outputs.indexed_folder import IndexedFolder
 from hyrfpack.scene import Scene
 from hyrfpack.splats.files import READABLE_ENDINGS, read_splats
+from hyrfpack.splats.names import is_splats
 from hyrfpack.web.gallery import STYLE_FILE_NAME as GALLERY_STYLE_NAME
 from hyrfpack.web.gallery import Card, encode_gallery, encode_gallery_style
 from hyrfpack.web.html import encode_views
@@ -267,8 +269,11 @@ def check_export_folder(
         is_gallery: check for the files of `export_gallery`.
 
     Raises:
-        HyrfError: a file must not be replaced or cannot be written.
+        HyrfError: a file must not be replaced or cannot be written, or photos are given with splats.
     """
+    for source, scene in zip(sources, scenes, strict=False):
+        if scene is not None and is_splats(source):
+            raise HyrfError(f"{source}: photos go with .hyrf files only", fix="leave out `data`, or this file")
     names = [name for pair in _choose_file_names(sources, is_gallery=is_gallery) for name in pair]
     names += [README_NAME, INDEX_NAME, *encode_player_files()]
     names += [GALLERY_PLAYER_NAME, GALLERY_STYLE_NAME] if is_gallery else [ELEMENT_SCRIPT_NAME]

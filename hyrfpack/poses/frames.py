@@ -80,6 +80,7 @@ class _VideoMeasurement:
         repeated_count: number of measured frames that equal the previous frame.
         seconds: duration of the decoded video.
         notes: sentences for the user.
+        size: (width, height) of the frames as they are written, upright and with square pixels.
     """
 
     numbers: np.ndarray
@@ -90,6 +91,7 @@ class _VideoMeasurement:
     repeated_count: int
     seconds: float
     notes: tuple[str, ...]
+    size: tuple[int, int]
 
 
 def choose_frames(
@@ -154,7 +156,8 @@ def survey_frames(video: StrPath, progress: Progress = ignore_progress) -> tuple
         video, progress: see `choose_frames`.
 
     Returns:
-        The report, the (width, height) of the stored frames, and the number of measured frames.
+        The report, the (width, height) of the frames as they are written, upright and with square pixels, and the
+            number of measured frames.
 
     Raises:
         HyrfDataError: see `choose_frames`.
@@ -166,7 +169,7 @@ def survey_frames(video: StrPath, progress: Progress = ignore_progress) -> tuple
     with open_video(video) as source:
         measured = _measure_video(video, source, progress)
         _, report = _choose_spaced_frames(video, measured, _DEFAULT_MAX_TAKEN_FRAMES, progress)
-        return report, source.size, len(measured.numbers) + measured.repeated_count
+        return report, measured.size, len(measured.numbers) + measured.repeated_count
 
 
 def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasurement:
@@ -178,6 +181,7 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
     thumbnails: list[np.ndarray] = []
     decoded_count, repeated_count, time, last_measured, longest_gap = 0, 0, 0.0, -np.inf, 0.0
     is_interlaced = changes_size = False
+    upright_size = (0, 0)
     for number, start, frame in video.frames():
         longest_gap, time = max(longest_gap, start - time), start
         decoded_count = number + 1
@@ -185,6 +189,8 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
         if time - last_measured < step * 0.98 and time > last_measured:
             continue
         last_measured = time
+        if not thumbnails:
+            upright_size = decode_upright(frame, video.aspect).size
         gray = decode_gray(frame, _SHARPNESS_SIDE_PIXELS)
         scale = TRACKING_SIDE_PIXELS / max(gray.shape)
         size = (max(8, round(gray.shape[1] * scale)), max(8, round(gray.shape[0] * scale)))
@@ -227,6 +233,7 @@ def _measure_video(path: Path, video: Video, progress: Progress) -> _VideoMeasur
         repeated_count,
         time,
         tuple(notes),
+        upright_size,
     )
 
 

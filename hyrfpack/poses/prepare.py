@@ -90,8 +90,9 @@ def read_headers(
         progress: called with a `TaskEvent` after each file.
 
     Returns:
-        The usable photos, sorted by name, and the reason for each photo that is left out, by its path below `root`. A
-        path that is not valid UTF-8, which pycolmap cannot store, has escapes in place of the invalid bytes.
+        The usable photos, sorted by name with numbers in their order, and the reason for each photo that is left out,
+        by its path below `root`. A path that is not valid UTF-8, which pycolmap cannot store, has escapes in place of
+        the invalid bytes.
 
     Raises:
         HyrfDataError: there is a panorama and `in_place` is set.
@@ -141,7 +142,14 @@ def read_headers(
             photo = Photo(_rewritten_name(source, taken_names), facts, source)
             taken_names.add(photo.name.casefold())
         photos.append(photo)
-    return sorted(photos, key=lambda photo: photo.name), left_out
+    return sorted(photos, key=lambda photo: _natural_key(photo.name)), left_out
+
+
+def _natural_key(name: str) -> tuple[list[str | int], str]:
+    """Return a key that sorts frame_2 before frame_10, so that neighbours in a sequence of frames stay neighbours."""
+    # Texts and numbers alternate, so that only equal kinds are compared.
+    parts = [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
+    return parts, name
 
 
 def select_unreadable(left_out: Mapping[str, str]) -> dict[str, str]:

@@ -28,21 +28,23 @@ class Video:
 
     Attributes:
         seconds: duration according to the header; 0 if the header has none.
-        size: (width, height) of the stored frames in pixels, before rotation.
         aspect: pixel aspect ratio, the width of a pixel divided by its height; 1 where the header has a ratio beyond
             MAX_PIXEL_ASPECT, which is damaged.
         damaged_count: number of packets and frames that could not be decoded so far.
     """
 
-    def __init__(self, container: Any) -> None:
-        self._container, self._stream = container, container.streams.video[0]
-        self._stream.thread_type = "AUTO"
+    def __init__(self, path: Path, container: Any) -> None:
+        self._path, self._container, self._stream = path, container, container.streams.video[0]
+        self._is_at_start = True
         self.damaged_count = 0
-        self.size = (self._stream.codec_context.width, self._stream.codec_context.height)
         aspect = float(self._stream.sample_aspect_ratio or 1)
         self.aspect = aspect if 1 / MAX_PIXEL_ASPECT <= aspect <= MAX_PIXEL_ASPECT else 1.0
         duration, unit = self._stream.duration, self._stream.time_base
         self.seconds = float(duration * unit) if duration and unit else (container.duration or 0) / 1e6
+
+    def close(self) -> None:
+        """Close the file."""
+        self._container.close()
 
     def frames(self) -> Iterator[tuple[int, float, Any]]:
         """Yield the number, the time in seconds and the av.VideoFrame of each decodable frame, in display order.
@@ -51,7 +53,12 @@ class Video:
         """
         import av
 
-        self._container.seek(0)
+        if not self._is_at_start:  # Raw streams cannot be rewound, so the file is opened again.
+            self.close()
+            self._container = _open_container(self._path)
+            self._stream = self._container.streams.video[0]
+        self._is_at_start = False
+        self._stream.thread_type = "AUTO"
         first_time, number, last_time = None, 0, 0.0
         packets = self._container.demux(self._stream)
         while True:
@@ -87,21 +94,14 @@ def open_video(path: Path) -> Iterator[Video]:
         HyrfError: PyAV is not installed.
     """
     with needs_package(f"{path}: reading videos"):
-        import av
+        import av  # noqa: F401 - `_open_container` imports it
     if not path.is_file():
         what = "this is a folder, not a video" if path.is_dir() else "there is no such file"
         raise HyrfDataError(f"{path}: {what}", fix="check the path")
     if path.stat().st_size == 0:
         raise HyrfDataError(f"{path}: the video is empty (0 bytes)", fix="copy it again")
-    try:
-        container = av.open(
-            os.path.abspath(path)
-        )  # FFmpeg takes what precedes a colon in a relative path for a protocol
-    except Exception as error:  # PyAV passes on many types of errors, of FFmpeg's demuxers and of the system
-        raise HyrfDataError(
-            f"{path}: this cannot be read as a video ({_error_text(error)})",
-            fix="copy it again in full, or save it as .mp4",
-        ) from error
+    container = _open_container(path)
+    video = None
     try:
         if not container.streams.video:
             raise HyrfDataError(f"{path}: the file has no video stream", fix="name a video")
@@ -109,9 +109,27 @@ def open_video(path: Path) -> Iterator[Video]:
             raise HyrfDataError(
                 f"{path}: the installed FFmpeg cannot decode this kind of video", fix="save it as H.264 (.mp4)"
             )
-        yield Video(container)
+        video = Video(path, container)
+        yield video
     finally:
-        container.close()
+        (video or container).close()
+
+
+def _open_container(path: Path) -> Any:
+    """Open a file with PyAV, which must be installed.
+
+    Raises:
+        HyrfDataError: FFmpeg cannot read it.
+    """
+    import av
+
+    try:
+        return av.open(os.path.abspath(path))  # FFmpeg takes what precedes a colon in a relative path for a protocol
+    except Exception as error:  # PyAV passes on many types of errors, of FFmpeg's demuxers and of the system
+        raise HyrfDataError(
+            f"{path}: this cannot be read as a video ({_error_text(error)})",
+            fix="copy it again in full, or save it as .mp4",
+        ) from error
 
 
 def decode_gray(frame: Any, max_side: int) -> np.ndarray:

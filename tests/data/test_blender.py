@@ -116,3 +116,19 @@ def test_a_broken_set_is_a_clear_error(tmp_path, opengl_frames, damage, says):
         load_scene(tmp_path)
 
     assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
+
+
+def test_intrinsics_of_other_programs_are_read_as_in_a_single_transforms_file(tmp_path, opengl_frames):
+    """Add-ons of Blender and instant-ngp write splits with their full lenses."""
+    lens = {"fl_x": 31.0, "fl_y": 29.0, "cx": 16.5, "cy": 9.0, "w": 30, "h": 20, "k1": 0.1, "p1": 0.001}
+    for folder in ("split", "single"):
+        (tmp_path / folder).mkdir()
+        write_blender(tmp_path / folder, opengl_frames, splits=("train",))
+        _edit_transforms(tmp_path / folder, camera_angle_x=0.9 if folder == "split" else None, **lens)
+    (tmp_path / "single" / "transforms_train.json").rename(tmp_path / "single" / "transforms.json")
+
+    split, single = (load_scene(tmp_path / folder, test_every=0) for folder in ("split", "single"))
+
+    assert (split.layout, single.layout) == ("blender", "nerfstudio")
+    assert [view.camera for view in split.train] == [view.camera for view in single.train]
+    assert split.train[0].camera.fx == 31 and split.train[0].is_resampled

@@ -291,6 +291,16 @@ def test_a_manifest_is_named_after_its_folder_before_and_after_the_work(tmp_path
         export_gallery([manifest], tmp_path / "old", overwrite=False)
 
 
+def test_photos_of_splats_are_refused(splats_file, tmp_path):
+    for call in (
+        lambda: export_player(splats_file, tmp_path / "page", data=ball_scene(3)),
+        lambda: export_gallery([splats_file], tmp_path / "page", data=[ball_scene(3)]),
+    ):
+        with pytest.raises(HyrfError, match="photos go with .hyrf files only; leave out `data`, or this file"):
+            call()
+    assert not (tmp_path / "page").exists()
+
+
 def test_a_wrong_number_of_photo_sets_is_refused(model_file, tmp_path):
     for sources, data, words in (([model_file], [None, None], "one for each"), ([], [], "there are no models")):
         with pytest.raises(ValueError, match=words):

@@ -19,7 +19,7 @@ from scipy import ndimage
 import hyrfpack
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.poses.frames import RECORD_NAME, choose_frames, frame_times
+from hyrfpack.poses.frames import RECORD_NAME, choose_frames, frame_times, survey_frames
 from hyrfpack.poses.hdr import HLG_TRANSFER, PQ_TRANSFER, tone_map_to_srgb
 from hyrfpack.poses.motion import motion_distances, track_windows
 from hyrfpack.poses.video import Video
@@ -203,6 +203,24 @@ def test_frames_are_mirrored_as_the_video_says(wall, tmp_path, matrix, show):
     choose_frames(video, tmp_path / "frames")
     number = frame_numbers(tmp_path / "frames")[2]
     assert mean_luma_difference(tmp_path / "frames", number, show(frames[number])) < 4
+
+
+def test_the_stated_size_is_that_of_the_frames_as_written(wall, tmp_path):
+    def turned(stream):
+        if not hasattr(stream, "set_display_rotation"):
+            pytest.skip("this version of PyAV cannot write a rotation")
+        stream.set_display_rotation(90)
+
+    frames = [crop_wall(wall, 4.0 * number) for number in range(40)]
+    _, size, _ = survey_frames(write_video(tmp_path / "clip.mp4", frames, set_up=turned))
+    assert size == (FRAME_HEIGHT, FRAME_WIDTH)
+
+
+def test_a_raw_stream_that_cannot_be_rewound_is_read_twice(wall, tmp_path):
+    frames = [crop_wall(wall, 4.0 * number) for number in range(40)]
+    choose_frames(write_video(tmp_path / "clip.h264", frames), tmp_path / "frames")
+    number = frame_numbers(tmp_path / "frames")[2]
+    assert mean_luma_difference(tmp_path / "frames", number, frames[number]) < 4
 
 
 def test_a_damaged_pixel_aspect_ratio_is_ignored(wall, tmp_path):

@@ -301,6 +301,13 @@ def test_photos_taken_in_quick_succession_or_numbered_frames_are_a_sequence(tmp_
     assert ordered == {"burst": True, "walk": False, "frames": True, "any": False}
 
 
+def test_frames_are_in_the_order_of_their_numbers_without_leading_zeros(tmp_path):
+    for seed, name in enumerate(("frame_10.png", "frame_9.png", "frame_1.png", "b2/1.png", "b10/1.png", "7.png")):
+        save_photo(tmp_path / "frames" / name, upright_picture(seed))
+    names = [photo.name for photo in read_photo_headers(tmp_path / "frames")[0]]
+    assert names == ["7.png", "b2/1.png", "b10/1.png", "frame_1.png", "frame_9.png", "frame_10.png"]
+
+
 def test_masks_are_rotated_with_their_photos(tmp_path):
     save_photo(tmp_path / "photos" / "a.jpg", upright_picture(), 6)
     save_photo(tmp_path / "photos" / "b.jpg", upright_picture(1))
