@@ -2,14 +2,16 @@
 //
 // Prints, as JSON, `late`: the number of requests for files after that; `refused`: for an answer that is longer than the
 // manifest says, and for one of a missing file, whether its request is cancelled; `partials`: the number of files whose
-// beginnings are kept after the requests for 100 files were cancelled one after the other; and `breaks`: how often the
-// connection breaks within a file before it is given up, if its request was cancelled 25 times before; and `bytes`: of a
-// file of 10 bytes that was received twice.
+// beginnings are kept after the requests for 100 files were cancelled one after the other; `breaks`: how often the
+// connection breaks within a file before it is given up, if its request was cancelled 25 times before; `bytes`: of a
+// file of 10 bytes that was received twice; and `sentence`: what the page is told if memory is too short for the first
+// picture.
 
 import { setTimeout as wait } from "node:timers/promises";
 
 import { copyManifest, requests, streamScene } from "./copied_scene.mjs";
 import { crc32 } from "../../hyrfpack/web/hyrf/crc.js";
+import { ScenePart } from "../../hyrfpack/web/viewer/stream/scene_part.js";
 import { FileQueue } from "../../hyrfpack/web/viewer/stream/file_queue.js";
 
 const QUIET_MS = 500;
@@ -84,5 +86,13 @@ for (const wanted of [1, 2]) {
   repeated.want([whole]);
   while (times < wanted) await wait(5);
 }
-console.log(JSON.stringify({ late, refused, partials: queue.partials.size, breaks, bytes: repeated.bytes }));
+
+let sentence = null;
+ScenePart.prototype.pack = async () => {
+  throw new RangeError("Array buffer allocation failed");
+};
+process.once("unhandledRejection", ({ message }) => (sentence = message)); // streamScene throws what the page is told
+streamScene(copyManifest(process.argv[2], 5, () => ({})), 1e6, () => {});
+while (sentence === null) await wait(20);
+console.log(JSON.stringify({ sentence, late, refused, partials: queue.partials.size, breaks, bytes: repeated.bytes }));
 process.exit();

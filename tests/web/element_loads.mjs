@@ -15,6 +15,8 @@
 //     `suspended`: what an element opens when it resumes, {addresses: requests, camera, size: of a Blob, name}, by what
 //         its viewer has shown before: the scene of `src`, that of another address, one of bytes, and one of a stream;
 //         and, after another address, for an element whose `camera` or `src` was changed meanwhile
+//     `failing`: the camera with which an element resumes its own scene after another could not be loaded; and the
+//         addresses that it opens when it resumes a scene of a script, which is missing, and when it resumes again
 //     `frame`: how many frames were made at first, and by the same `src` after an error and after a load
 
 const addresses = [], frames = [], listeners = [];
@@ -200,6 +202,30 @@ result.suspended = {
   camera: await resumeAfter("other.hyrf", (element) => element.setAttribute("camera", "3")),
   src: await resumeAfter("other.hyrf", (element) => element.setAttribute("src", "new.hyrf")),
 };
+
+
+// The same for an element with a scene of its own, of which a script has loaded another that is missing.
+const failing = await connect({ src: "own.hyrf" }), { view } = failing;
+showLast(failing.viewer);
+Object.defineProperty(failing.viewer, "cameraText", { value: "its camera" });
+failing.viewer.load("missing.hyrf").catch(() => {});
+await wait();
+answer();
+await wait();
+view.suspend();
+view.open();
+const resumed = [failing.viewer.currentLoad.firstCamera];
+failing.viewer.load("other.hyrf").catch(() => {});
+showLast(failing.viewer);
+for (const isMissing of [true, false]) {
+  view.suspend();
+  view.open();
+  resumed.push(addresses.at(-1));
+  await wait();
+  if (isMissing) answer();
+  await wait();
+}
+result.failing = resumed;
 
 const framed = await connect({ src: "a.hyrf", player: "index.html", frame: "" });
 const send = (hyrf) => listeners.at(-1)({ source: frames.at(-1), data: { hyrf, message: "" } });

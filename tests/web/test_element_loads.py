@@ -66,3 +66,7 @@ def test_a_suspended_element_resumes_the_scene_that_it_showed(
 
 def test_a_frame_is_made_again_by_the_same_src_only_after_an_error(loads: dict):
     assert loads["frame"] == [1, 1, 0]
+
+
+def test_a_suspended_element_comes_back_with_what_it_showed_and_else_with_its_own_scene(loads: dict):
+    assert loads["failing"] == ["its camera", "other.hyrf", "own.hyrf"]

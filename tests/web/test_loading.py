@@ -52,6 +52,10 @@ def test_a_file_that_is_fetched_again_counts_once(closed_stream: dict):
     assert closed_stream["bytes"] == 10
 
 
+def test_a_scene_that_memory_is_too_short_for_is_an_error_of_the_page(closed_stream: dict):
+    assert "memory" in closed_stream["sentence"]
+
+
 def test_few_beginnings_of_files_that_are_no_longer_wanted_are_kept(closed_stream: dict):
     assert closed_stream["partials"] == 32
 

@@ -93,7 +93,7 @@ export function parseCamera(text, scene) {
 export function formatCamera(eye, scene) {
   const { fy, camera_from_world: pose } = cameraOf(eye.view(LINK_SIDE_PIXELS, LINK_SIDE_PIXELS), scene);
   const position = toWorld(eye.position, scene);
-  const digits = Math.min(15, Math.max(0, 5 - Math.floor(Math.log10(scene.unit * Math.max(eye.pace, 1e-9)))));
+  const digits = Math.min(100, Math.max(0, 5 - Math.floor(Math.log10(scene.unit * Math.max(eye.pace, 1e-9)))));
   const lengths = [...position, scene.unit * eye.depth].map((value) => Number(value.toFixed(digits)));
   const quat = quatOf(pose.slice(0, 3).map((row) => row.slice(0, 3))).map((value) => Number(value.toFixed(6)));
   return [...lengths.slice(0, 3), ...quat, Number((fy / LINK_SIDE_PIXELS).toPrecision(6)), lengths[3]].join(",");

@@ -72,10 +72,12 @@ export class InlineView {
   }
 
   // Lets the next viewer show the scene and the camera of this one, also if a script has loaded the scene, but not from
-  // a stream, which cannot be read again. After a failed load, the next viewer tries the scene of `src`.
+  // a stream, which cannot be read again. After a failed load, the next viewer tries the scene of `src`, unless another
+  // scene is still shown.
   keepScene() {
     const { currentLoad, isCurrentShown, cameraText } = this.viewer ?? {};
-    if (!currentLoad || this.isLoadFailed) return;
+    if (this.isLoadFailed && !isCurrentShown) this.suspended = null;
+    if (!currentLoad || (this.isLoadFailed && !isCurrentShown)) return;
     const { source, name, firstCamera } = currentLoad;
     this.suspended = source && { src: source, name, camera: isCurrentShown ? cameraText : firstCamera };
   }

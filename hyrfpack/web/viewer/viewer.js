@@ -352,17 +352,17 @@ function resolveWorker(address) {
 
 // Returns {number} or {view, depth} of a camera: its index from 0, its text in a link, or a camera in world units.
 function readCamera(camera, scene) {
-  if (typeof camera === "string") {
-    try {
-      return parseCamera(camera, scene);
-    } catch ({ message }) {
-      throw new Error(`The camera ${camera} cannot be used: ${message}.`);
-    }
-  }
-  if (camera === null || !["number", "object"].includes(typeof camera)) {
+  const isText = typeof camera === "string";
+  if (camera === null || !["number", "object", "string"].includes(typeof camera)) {
     throw new Error(`A camera is a number, a text or an object, not ${String(camera)}.`);
   }
-  if (typeof camera === "object") return { view: viewOf(camera, scene) };
+  if (typeof camera !== "number") {
+    try {
+      return isText ? parseCamera(camera, scene) : { view: viewOf(camera, scene) };
+    } catch ({ message }) {
+      throw new Error(`The camera ${isText ? `${camera} ` : ""}cannot be used: ${message}.`);
+    }
+  }
   if (Number.isInteger(camera) && camera >= 0 && camera < scene.cameras.length) return { number: camera };
   throw new Error(`There is no camera ${camera}; the scene has cameras 0 to ${scene.cameras.length - 1}.`);
 }

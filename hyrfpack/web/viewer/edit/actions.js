@@ -118,7 +118,7 @@ function turnedBack(rows, turn, middle) {
 
 // Rounds a position or a length to a step that is invisible in a scene of a size, both in world units.
 export function roundLength(value, size) {
-  const digits = Math.min(20, Math.max(0, POSITION_DIGITS_IN_UNIT_SCENE - Math.floor(Math.log10(size))));
+  const digits = Math.min(100, Math.max(0, POSITION_DIGITS_IN_UNIT_SCENE - Math.floor(Math.log10(size))));
   return Number(value.toFixed(digits)) + 0; // turns -0 into 0
 }
 

@@ -30,7 +30,8 @@ export class Editor {
     }
     const { actions } = panel, closeOthers = actions.Escape;
     actions.I = () => this.toggle();
-    actions.Escape = () => (element("edit").hidden ? closeOthers() : this.toggle(false));
+    const isCovered = () => ["settings", "message", "toast"].some((id) => !element(id).hidden);
+    actions.Escape = () => (element("edit").hidden || isCovered() ? closeOthers() : this.toggle(false));
     element("edit-undo").onclick = () => this.go(-1);
     element("edit-redo").onclick = () => this.go(1);
     addEventListener("keydown", (event) => this.key(event));

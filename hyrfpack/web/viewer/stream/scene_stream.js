@@ -79,7 +79,7 @@ export class SceneStream {
     try {
       this.open();
     } catch (error) {
-      post({ error: error.message });
+      post({ error: explainMemory(error).message });
     }
   }
 
@@ -241,8 +241,9 @@ export class SceneStream {
     const read = first.length - missing.length;
     this.post({ progress: { what: "loading", part: read / Math.max(1, first.length) } });
     const hasLost = this.queue.losses > MAX_EARLY_LOSSES;
-    if (scene.isRead && (!missing.length || (hasLost && read))) this.postContent();
-    else if (hasLost) this.fail(`${new URL(this.queue.folder).host} does not answer; reload the page to try again`);
+    if (scene.isRead && (!missing.length || (hasLost && read))) {
+      this.postContent().catch((error) => this.fail(explainMemory(error).message));
+    } else if (hasLost) this.fail(`${new URL(this.queue.folder).host} does not answer; reload the page to try again`);
   }
 
   // Returns the part that a chunk belongs to.
