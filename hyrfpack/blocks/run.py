@@ -8,6 +8,7 @@ import logging
 import math
 import time
 from collections import Counter
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,7 @@ from hyrfpack.train.finish import TrainResult
 from hyrfpack.train.results import VIEWS_FOLDER, remove_results, scene_facts
 from hyrfpack.train.run import Observer, resuming, train_model, without_resume_hint
 from hyrfpack.train.setup import PACKED_HEADER_BYTES, budget_for, check_target
+from hyrfpack.train.stop import catch_stop_signals
 from hyrfpack.version import __version__
 
 _LOG = logging.getLogger(__name__)
@@ -225,9 +227,10 @@ class _BlockRun:
                     config = self._block_config(block) if is_mine else None
                     if config is None or self.journal.is_finished(block.name):
                         continue
-                    result = self._train_block(block, config)
+                    with catch_stop_signals(self.context.stop) as stop:
+                        result = self._train_block(block, config, stop)
                 steps, trained = steps + result.step, True
-                if not result.complete:
+                if not result.complete or stop():  # A signal in the last step lets the block finish.
                     return TrainResult(False, steps, None, {})
             # Other processes are training what is left, or deciding its settings. If one of them ends, its claim ends.
             if not trained:
@@ -252,8 +255,8 @@ class _BlockRun:
             return nullcontext(True)
         return try_lock(self.journal.path.parent / f"{block.name}.lock")
 
-    def _train_block(self, block: Block, config: TrainConfig) -> TrainResult:
-        """Train a block, or resume it if its training has begun."""
+    def _train_block(self, block: Block, config: TrainConfig, stop: Callable[[], bool]) -> TrainResult:
+        """Train a block, or resume it if its training has begun; `stop` returns whether to stop."""
         label = f"block {block.name} ({self.plan.blocks.index(block) + 1} of {len(self.plan.blocks)})"
         _LOG.info(f"{label}: {len(block.photos)} photos, {block.point_count:,} points")
         resumes = self.journal.is_begun(block.name)
@@ -268,7 +271,7 @@ class _BlockRun:
                 observer=self.observer if self.ranks.is_main else None,
                 log=None if self.log is None else block_log_path(self.log, block),
                 context=dataclasses.replace(
-                    self.context, ranks=None, progress=None if is_silent else self.context.progress
+                    self.context, ranks=None, progress=None if is_silent else self.context.progress, stop=stop
                 ),
             )
             if result.missing:

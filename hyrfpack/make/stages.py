@@ -196,7 +196,7 @@ def _train(
         )  # fmt: skip
     except HyrfError as error:  # the fix of this error refers to the command `train`
         plain = without_resume_hint(error)
-        if resume and "" not in begun and isinstance(plain, HyrfTrainingError):  # the checkpoint cannot be used
+        if resume and not begun and isinstance(plain, HyrfTrainingError):  # the checkpoint cannot be used
             plain = plain.with_text(fix=f"delete {run} and run the same command again")
         raise plain from None
     if not trained.complete:

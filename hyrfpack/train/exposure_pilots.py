@@ -47,7 +47,7 @@ def exposure_pilot_steps(steps: int) -> int:
 
 
 def exposure_rounds(count: int) -> int:
-    """Return the largest number of rounds of two pilots that a scene needs.
+    """Return the largest number of rounds of two pilots that a scene without masks or shared positions needs.
 
     Each round has another seed and another fold, so that scenes of few photos take more rounds.
 
@@ -66,9 +66,9 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
     plain PSNR over the validation photos of all rounds. Where the photos' exposures differ by
     `LARGE_EXPOSURE_SPREAD_STOPS`, per-image gains are learnt unless the pilots lose more than `MAX_EXPOSURE_LOSS_DB`.
     Elsewhere they are learnt if the pilots gain at least `MIN_EXPOSURE_GAIN_DB` and at least `MIN_GAIN_STANDARD_ERRORS`
-    times the standard error. If masks leave fewer than `MIN_EXPOSURE_VALIDATION_VIEWS` photos to score, none are
-    learnt, which is the safe default. The rounds end early if the mean gain is clear, or not positive where the photos
-    differ little.
+    times the standard error. The rounds end early if the mean gain is clear, or not positive where the photos differ
+    little. If masks or shared positions leave fewer than `MIN_EXPOSURE_VALIDATION_VIEWS` photos to score in all folds,
+    no gains are learnt, which is the safe default.
 
     Returns:
         Whether to learn per-image gains, and the reason in words.
@@ -83,8 +83,10 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
     limit = -MAX_EXPOSURE_LOSS_DB if is_large else MIN_EXPOSURE_GAIN_DB
     rounds, steps = exposure_rounds(len(pilots.scene.train)), exposure_pilot_steps(pilots.config.steps)
     gains: list[float] = []  # The PSNR gain of each validation photo in dB.
-    for number in range(rounds):
-        gains += _gain_per_view(pilots, number, rounds, steps)
+    for number in range(EXPOSURE_VALIDATION_EVERY):
+        if number >= rounds and len(gains) >= MIN_EXPOSURE_VALIDATION_VIEWS:
+            break
+        gains += _gain_per_view(pilots, number, max(rounds, number + 1), steps)
         if gains and not is_large and np.mean(gains) <= 0:
             break
         if len(gains) >= MIN_EXPOSURE_VALIDATION_VIEWS:
@@ -93,7 +95,10 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
                 break
     is_loss = len(gains) > 1 and not is_large and np.mean(gains) <= 0
     if len(gains) < MIN_EXPOSURE_VALIDATION_VIEWS and not is_loss:
-        return False, f"masks leave {len(gains)} of the validation photos, too few to measure whether gains help"
+        return False, (
+            f"masks or shared positions leave {len(gains)} of the validation photos, too few to measure whether gains "
+            "help"
+        )
     gain, error = _mean_and_standard_error(gains)
     needed = limit if is_large else max(limit, MIN_GAIN_STANDARD_ERRORS * error)
     return gain >= needed, (

@@ -58,19 +58,27 @@ def finish_run(
         log: the run's log.
         owns_checkpoint: whether a checkpoint in the folder belongs to this run.
     """
-    for name in PREPARED_FILES:  # While the training record is still there, so that nobody resumes from them.
-        remove_if_possible(out / name)
+    if read_record(out) is not None:  # Nobody resumes from them while the training record is there.
+        _remove_prepared(out)
     results = write_results(record, scene, out, config, device, progress, overwrite=overwrite)
     missing = _log_missing(results)
-    # Without a training record, only the checkpoint lets a later call complete the results.
-    if owns_checkpoint and (not results.missing or read_record(out) is not None):
-        remove_if_possible(out / CHECKPOINT_FILE)
+    # Without a training record, only the checkpoint and its preparation let a later call complete the results.
+    if not results.missing or read_record(out) is not None:
+        _remove_prepared(out)
+        if owns_checkpoint:
+            remove_if_possible(out / CHECKPOINT_FILE)
     if log is not None:
         facts = {name: results.metrics[name] for name in ("gaussians", "bytes")}
         scores = results.metrics.get("evaluation", {})
         facts |= {name: scores[name] for name in ("psnr", "ssim") if name in scores}
         log.end(complete=True, step=record.step, **facts)
     return TrainResult(True, record.step, out / record.model, results.metrics, missing)
+
+
+def _remove_prepared(out: Path) -> None:
+    """Remove what runs before the training itself have left for a resumed run."""
+    for name in PREPARED_FILES:
+        remove_if_possible(out / name)
 
 
 def _log_missing(results: Results) -> str:

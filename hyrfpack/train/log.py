@@ -77,7 +77,7 @@ class TrainingLog:
             _LOG.warning(describe_rename(path, self.path))
         self.scalars: Any = None
         with self._scalars_dropped_on_error():
-            self.scalars = _summary_writer(_scalars_folder(self.path))
+            self.scalars = _summary_writer(_scalars_folder(self.path), done)
 
     def step(self, event: StepEvent) -> None:
         """Add a finished step, and write a record if one is due."""
@@ -208,9 +208,10 @@ def _scalars_folder(log: Path) -> Path:
     return log.with_suffix(".tensorboard")
 
 
-def _summary_writer(folder: Path) -> Any:
+def _summary_writer(folder: Path, done: int) -> Any:
+    """Return TensorBoard's writer, or None without TensorBoard; earlier scalars after step `done` no longer count."""
     if find_spec("tensorboard") is None:
         return None
     from torch.utils.tensorboard import SummaryWriter
 
-    return SummaryWriter(str(folder))
+    return SummaryWriter(str(folder), purge_step=done + 1)

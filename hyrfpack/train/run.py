@@ -24,6 +24,7 @@ from hyrfpack.format.run_folder import (
     MODEL_FILE,
     PREPARED_FILES,
     is_prepared,
+    read_run_status,
 )
 from hyrfpack.lock import exclusive_folder
 from hyrfpack.outputs import Outputs
@@ -306,7 +307,8 @@ class _Run:
         """Train, and on rank 0 write the model and the results."""
         trainer = self._set_up(decisions)
         if trainer is None:
-            return TrainResult(False, 0, None, {})
+            step = read_run_status(self.out).step if self._has_checkpoint() else None
+            return TrainResult(False, step or 0, None, {})
         with ExitStack() as stack:
             with _checkpoint_named_in_errors(trainer, self.overwrite):
                 if self.ranks.is_main:

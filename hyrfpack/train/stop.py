@@ -6,6 +6,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 # These signals end a run early (Windows has no SIGHUP).
 STOP_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -25,6 +26,8 @@ def catch_stop_signals(stop: Callable[[], bool] | None = None) -> Iterator[Calla
     Args:
         stop: returns whether something else than a signal has asked to stop.
 
+    Blocks may be nested: a signal within the inner one is a request in both.
+
     Yields:
         A function that returns whether a stop was requested.
     """
@@ -40,11 +43,16 @@ def catch_stop_signals(stop: Callable[[], bool] | None = None) -> Iterator[Calla
     found = {number: signal.getsignal(number) for number in STOP_SIGNALS}
     previous = {number: handler for number, handler in found.items() if handler not in (signal.SIG_IGN, None)}
 
-    def handle(number: int, _frame: object) -> None:
+    def handle(number: int, frame: FrameType | None) -> None:
         nonlocal is_signalled
         is_signalled = True
-        if number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, previous[number])
+        outer = previous[number]
+        if getattr(outer, "is_request", False) and callable(outer):  # A stop that ends this block ends the outer one.
+            outer(number, frame)
+        elif number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, outer)
+
+    handle.is_request = True  # type: ignore[attr-defined]
 
     try:
         for number in previous:

@@ -49,7 +49,9 @@ def _constant(picture: Picture) -> Callable[[], Picture]:
 def _render_mean(models: Sequence[HybridModel], camera: Camera) -> Picture:
     """Return the mean of the models' renders of a view, transparent where models without a background are."""
     settings = RenderSettings(exposure=CONSISTENT_EXPOSURE)
-    renders = [render_view(model, camera, settings) for model in models]
+    # Colours over black are those times alpha. The solid colour of the scene is laid behind the view in training.
+    black = torch.zeros(3, device=models[0].gaussians.positions.device)
+    renders = [render_view(model, camera, settings, solid=black) for model in models]
     rgb = torch.stack([render.rgb for render in renders]).mean(0).clamp(0, 1)
     if models[0].config.background:
         return Picture(_to_bytes(rgb))

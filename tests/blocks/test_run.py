@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import shutil
+import signal
 
 import numpy as np
 import pytest
@@ -222,6 +223,21 @@ def test_an_error_names_the_block_and_says_how_to_continue(tmp_path):
     scene = dataclasses.replace(block_scene(), has_alpha=True)
     with pytest.raises(HyrfError, match=r"^block \d-1 \(1 of 2\): .*transparent.*kept.*`resume=True` continues"):
         train_blocks(scene, tmp_path / "run", BLOCK_CONFIG, "2x1", context=QUIET_CONTEXT)
+
+
+@pytest.mark.usefixtures("signals")
+def test_a_signal_in_the_last_step_of_a_block_starts_no_other_block(tmp_path):
+    steps: list[StepEvent] = []
+
+    def stop_at_the_end(event: object) -> None:
+        if isinstance(event, StepEvent):
+            steps.append(event)
+            if event.step == event.steps:
+                signal.raise_signal(signal.SIGTERM)
+
+    context = RunContext(progress=stop_at_the_end)
+    result = train_blocks(block_scene(), tmp_path / "run", BLOCK_CONFIG, "2x1", context=context)
+    assert not result.complete and len(steps) == BLOCK_CONFIG.steps == result.step
 
 
 @pytest.mark.acceptance

@@ -333,13 +333,14 @@ def test_a_preview_shows_a_teacher_run_until_the_next_run_has_as_many_steps(runs
     assert previews == ([] if shown is None else [shown])
 
 
-def test_an_error_of_a_resumed_training_keeps_its_advice_once_the_run_has_begun(posed, tmp_path, monkeypatch):
+@pytest.mark.parametrize("kinds", [("teacher run", ""), ("pilot run",)])
+def test_an_error_of_a_resumed_training_keeps_its_advice_once_a_run_has_begun(posed, tmp_path, monkeypatch, kinds):
     with pytest.raises(Stopped):
         make_scene(posed, tmp_path / "scene.html", context=RunContext(progress=stop_at_step_5))
 
     def fail(scene, run, config, *, observer, **options) -> TrainResult:
-        for kind, step in (("teacher run", 1_000), ("", 3)):
-            observer(SimpleNamespace(kind=kind, step=step, steps=3_000))
+        for kind in kinds:
+            observer(SimpleNamespace(kind=kind, step=3, steps=3_000))
         raise HyrfTrainingError("the loss is not finite", fix="look at the photo")
 
     monkeypatch.setattr(stages, "train_model", fail)

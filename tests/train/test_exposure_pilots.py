@@ -110,7 +110,9 @@ def test_too_few_unmasked_validation_photos_decide_nothing(scores, monkeypatch, 
     decision, reason = measure_exposure(
         ScenePilots(dataclasses.replace(scene, train=views), LONG_CONFIG, PictureCache(), CPU_DEVICE)
     )
-    assert decision is False and reason.startswith(f"masks leave {left} of the validation photos, too few")
+    assert decision is False and reason.startswith(
+        f"masks or shared positions leave {left} of the validation photos, too few"
+    )
 
 
 def test_a_loss_that_ends_the_rounds_early_is_the_reason_also_of_few_validation_photos(scores, monkeypatch):
@@ -174,6 +176,15 @@ def test_few_photos_take_more_folds_so_that_six_photos_validate(scores, monkeypa
     names = [name for views in validated for name in views]
     assert decision and len(validated) == rounds
     assert len(set(names)) == len(names) >= 6
+
+
+def test_photos_at_one_position_take_a_further_fold(scores, monkeypatch):
+    """Photos of one position are in one fold, so that three folds may hold fewer than six photos."""
+    monkeypatch.setattr(exposure_pilots, "estimate_exposure_spread", lambda *_: 1.0)
+    scores |= {False: [20.0] * 4, True: [21.0] * 4}
+    monkeypatch.setattr(exposure_pilots, "_gain_per_view", lambda pilots, number, *_: [1.0] * (6 if number == 3 else 1))
+    decision, reason = measure_exposure(ScenePilots(make_scene(9), LONG_CONFIG, PictureCache(), CPU_DEVICE))
+    assert decision and "on 9 validation photos" in reason
 
 
 @pytest.mark.parametrize(

@@ -160,8 +160,8 @@ def test_scalars_are_written_to_tensorboard_where_it_is_installed(
     scalars: dict[str, list[tuple[int, float]]] = {}
 
     class Writer:
-        def __init__(self, folder: str) -> None:
-            assert folder == str(tmp_path / "log.tensorboard")
+        def __init__(self, folder: str, purge_step: int) -> None:
+            assert (folder, purge_step) == (str(tmp_path / "log.tensorboard"), 1)
 
         def add_scalar(self, name: str, value: float, step: int) -> None:
             scalars.setdefault(name, []).append((step, value))
@@ -186,7 +186,7 @@ def test_an_error_of_tensorboard_ends_its_scalars_and_not_the_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, broken: str
 ) -> None:
     class Writer:
-        def __init__(self, folder: str) -> None:
+        def __init__(self, folder: str, purge_step: int) -> None:
             fail_in("__init__")
 
         def add_scalar(self, name: str, value: float, step: int) -> None:

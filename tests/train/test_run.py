@@ -302,6 +302,18 @@ def test_the_first_interrupt_requests_a_stop_and_the_second_interrupts():
 
 
 @pytest.mark.usefixtures("signals")
+def test_a_signal_in_an_inner_block_is_a_request_in_the_outer_one_and_the_second_interrupts():
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), catch_stop_signals() as outer:
+        with catch_stop_signals() as inner:
+            assert not inner() and not outer()
+            signal.raise_signal(signal.SIGINT)
+            assert inner() and outer()
+            signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
 def test_sigterm_and_sighup_request_a_stop_too(name):
     number = getattr(signal, name, None) or pytest.skip(f"there is no {name} here")

@@ -19,7 +19,7 @@ from hyrfpack.format.run_folder import TEACHER_FILES
 from hyrfpack.model import HybridModel
 from hyrfpack.progress import Event, TaskEvent
 from hyrfpack.render import RenderSettings, render_view
-from hyrfpack.train import TrainConfig, Trainer, teachers, train_model
+from hyrfpack.train import TrainConfig, Trainer, results, teachers, train_model
 from hyrfpack.train.exposure_map import fit_exposure_map
 from hyrfpack.train.resolution import PhotoSize
 from hyrfpack.train.run import is_begun
@@ -72,9 +72,11 @@ def teacher(seed: int = 0, **settings) -> HybridModel:
 # -- rendering -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("background", [False, True])
-def test_a_virtual_view_is_the_mean_render_at_one_exposure(background):
-    models = [teacher(seed, background=background) for seed in (0, 1)]
+@pytest.mark.parametrize(
+    ("background", "solid"), [(False, (0.0, 0.0, 0.0)), (True, (0.0, 0.0, 0.0)), (False, (1.0, 0.9, 0.2))]
+)
+def test_a_virtual_view_is_the_mean_render_at_one_exposure(background, solid):
+    models = [teacher(seed, background=background, solid=solid) for seed in (0, 1)]
     cameras = ring(5)
     poses = [models[0].config.frame.local_pose(camera) for camera in cameras]
     models[0].exposure = fit_exposure_map(poses, np.random.default_rng(0).normal(0, 0.7, (5, 3))).map
@@ -84,7 +86,7 @@ def test_a_virtual_view_is_the_mean_render_at_one_exposure(background):
         renders = [render_view(model, view.camera, RenderSettings(exposure="consistent")) for model in models]
         picture, shown = view.load(), torch.stack([render.rgb for render in renders]).mean(0)
         assert (picture.alpha is None) == background
-        colors = torch.from_numpy(picture.composite(np.zeros(3, np.float32)))
+        colors = torch.from_numpy(picture.composite(np.array(solid, np.float32)))
         torch.testing.assert_close(colors.float(), shown, rtol=0, atol=1.5 / 255)
 
 
@@ -189,6 +191,32 @@ def test_a_run_that_is_stopped_later_has_the_same_virtual_views_when_it_resumes(
     train_model(make_scene(6), again, TAUGHT_CONFIG, resume=True, context=follow_teachers(numbers))
     assert numbers == ([] if damage is None else [2])
     assert read_model(again) == read_model(tmp_path / "whole") and not left_teachers(again)
+
+
+@pytest.mark.usefixtures("short_teachers", "signals")
+def test_a_stop_while_virtual_views_are_rendered_again_reports_the_step_of_the_checkpoint(tmp_path):
+    train_model(make_scene(6), tmp_path, TAUGHT_CONFIG, context=interrupt_at(6))
+
+    def interrupt(event: Event) -> None:
+        if isinstance(event, TaskEvent) and "virtual views" in event.task:
+            signal.raise_signal(signal.SIGTERM)
+
+    stopped = train_model(make_scene(6), tmp_path, TAUGHT_CONFIG, resume=True, context=RunContext(progress=interrupt))
+    assert (stopped.complete, stopped.step) == (False, 6)
+
+
+@pytest.mark.usefixtures("short_teachers")
+def test_teachers_stay_as_long_as_the_checkpoint_that_completes_the_results(tmp_path, monkeypatch):
+    def refuse(path: Path, *arguments: object, **options: object) -> None:
+        raise HyrfError(f"{path}: the disk is full", fix="free space")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(results, "write_atomic", refuse)
+        assert train_model(make_scene(6), tmp_path, TAUGHT_CONFIG, context=QUIET_CONTEXT).missing
+    assert left_teachers(tmp_path) == sorted(TEACHER_FILES) and (tmp_path / "checkpoint.pt").exists()
+    numbers: list[int] = []
+    train_model(make_scene(6), tmp_path, TAUGHT_CONFIG, resume=True, context=follow_teachers(numbers))
+    assert numbers == [] and not left_teachers(tmp_path) and not is_begun(tmp_path)
 
 
 @pytest.mark.usefixtures("short_teachers", "signals")
