@@ -158,12 +158,16 @@ def test_the_bound_of_harmonics_hardly_changes_a_picture() -> None:
 
 
 @pytest.mark.parametrize(
-    "change",
-    [lambda s: s[:0], lambda s: replace(s, opacities=np.zeros(len(s))), lambda s: replace(s, scales=s.scales * 0)],
+    ("change", "problem"),
+    [
+        (lambda s: s[:0], "there is no Gaussian in it"),
+        (lambda s: replace(s, opacities=np.zeros(len(s))), "no Gaussian is visible"),
+        (lambda s: replace(s, scales=s.scales * 0), "no Gaussian is visible"),
+    ],
     ids=["none", "clear", "points"],
 )
-def test_splats_that_cannot_be_seen_are_a_clear_error(tmp_path: Path, change) -> None:
-    with pytest.raises(HyrfDataError, match="^ball.ply: no Gaussian is visible"):
+def test_splats_that_cannot_be_seen_are_a_clear_error(tmp_path: Path, change, problem: str) -> None:
+    with pytest.raises(HyrfDataError, match=f"^ball.ply: {problem}"):
         import_loaded_splats(change(ball_splats(20)), tmp_path / "x.hyrf", TINY_IMPORT_CONFIG, name="ball.ply")
 
 
