@@ -21,7 +21,9 @@ def open_cache_folder(name: str) -> Path:
     """
     home = os.path.expanduser("~")
     default_caches = {"darwin": f"{home}/Library/Caches", "win32": os.environ.get("LOCALAPPDATA", home)}
-    caches = os.environ.get("XDG_CACHE_HOME") or default_caches.get(sys.platform, f"{home}/.cache")
+    caches = os.environ.get("XDG_CACHE_HOME", "")
+    if not os.path.isabs(caches):  # The specification of the variable says that a relative path is ignored.
+        caches = default_caches.get(sys.platform, f"{home}/.cache")
     user = os.getuid() if hasattr(os, "getuid") else "user"
     # Without a known home, expanduser returns "~", which would be a folder in the working directory.
     homes = [Path(caches, "hyrfpack")] if os.path.isabs(caches) else []

@@ -55,3 +55,10 @@ def test_without_a_known_home_the_cache_is_in_the_temporary_folder(home, tmp_pat
 
     assert folder.parent.parent == tmp_path / "temporary"
     assert [path.name for path in tmp_path.iterdir()] == ["temporary"]
+
+
+def test_a_relative_cache_folder_is_ignored(tmp_path, monkeypatch):
+    monkeypatch.setattr(os.path, "expanduser", lambda _: str(tmp_path))
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", "caches")
+    assert open_cache_folder("archives") == tmp_path / ".cache" / "hyrfpack" / "archives"

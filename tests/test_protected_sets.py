@@ -117,8 +117,7 @@ def test_make_protects_the_photos_and_poses_of_its_source(name, folder, overwrit
 
     for output in (folder, f"{folder}/new.html"):
         with pytest.raises(HyrfError):
-            for outputs in source.output_rules(overwrite):
-                outputs.file(output)
+            source.output_rules(overwrite).file(output)
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

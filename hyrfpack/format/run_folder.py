@@ -33,7 +33,7 @@ class RunStatus:
     Attributes:
         folder: folder of the run.
         finished: whether the model exists and no checkpoint is left.
-        has_checkpoint: whether `hyrfpack train --resume` can continue the run.
+        has_checkpoint: whether there is a checkpoint, with which `hyrfpack train --resume` continues the training.
         step: optimiser steps taken, from the checkpoint or, if the run has finished, from its settings.
         steps: optimiser steps of the whole run.
         photos: folder of the training photos.
@@ -85,8 +85,7 @@ def is_scene_manifest(path: str | os.PathLike[str]) -> bool:
 def find_model(path: str | os.PathLike[str]) -> Path:
     """Return the path of a `.hyrf` file: `path` itself, or the model if `path` is the folder of a training run.
 
-    The model of a run comes first, if the folder has a manifest of a scene, too.
-    Of a scene folder, it is the path of the manifest.
+    Of a scene folder, it is the path of the manifest. If the folder is also that of a run, the run counts.
 
     Raises:
         HyrfFormatError: `path` is a folder without a model, one that may not be read, or that of a run that has not
@@ -102,15 +101,18 @@ def find_model(path: str | os.PathLike[str]) -> Path:
         return path
     if _has_file(path, MODEL_FILE):
         return path / MODEL_FILE
-    if is_scene_manifest(path / SCENE_MANIFEST_FILE):
-        return path / SCENE_MANIFEST_FILE
     if _is_unfinished_run(path):
         raise HyrfFormatError(f"{path}: {describe_unfinished_run(read_run_status(path))}", fix=FINISH_RUN_ADVICE)
+    manifest = path / SCENE_MANIFEST_FILE
+    if is_scene_manifest(manifest):
+        return manifest
     if not os.access(path, os.X_OK):
         raise HyrfFormatError(f"{path}: permission to read the folder is denied", fix="check its permissions")
+    if _has_file(path, SCENE_MANIFEST_FILE) and not os.access(manifest, os.R_OK):
+        raise HyrfFormatError(f"{manifest}: permission to read the file is denied", fix="check its permissions")
     if _has_file(path, SCENE_MANIFEST_FILE):
         raise HyrfFormatError(
-            f"{path / SCENE_MANIFEST_FILE}: this is not the manifest of a scene folder, and there is no {MODEL_FILE}",
+            f"{manifest}: this is not the manifest of a scene folder, and there is no {MODEL_FILE}",
             fix="name a .hyrf file, or copy the whole folder of the scene again",
         )
     raise HyrfFormatError(

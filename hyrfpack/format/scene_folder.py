@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from hyrfpack.errors import HyrfFormatError, short_reason
 from hyrfpack.format.container import Container, open_regular_file, raw_bytes_limit, read_container
 from hyrfpack.format.metadata import read_metadata
-from hyrfpack.format.run_folder import MODEL_FILE, is_scene_manifest, name_model
+from hyrfpack.format.run_folder import is_run_folder, is_scene_manifest, name_model
 from hyrfpack.format.scene_manifest import (
     FORMAT_NAME,
     MANIFEST_NAME,
@@ -44,11 +44,11 @@ COPY_AGAIN_FIX = "copy the whole folder again, or split the model again"
 def is_scene(path: StrPath) -> bool:
     """Return whether a path names a scene folder, its manifest or a .zip of it.
 
-    The folder of a run is none, even if it has a manifest, too: as for `find_model`, its own model comes first.
+    The folder of a run is none, even if it has a manifest, too: as for `find_model`, the run counts.
     """
     path = Path(path)
     if not _is_zip(path):
-        return is_scene_manifest(_find_manifest(path)) and not os.path.isfile(path / MODEL_FILE)
+        return is_scene_manifest(_find_manifest(path)) and not is_run_folder(path)
     try:
         with closing(_SceneFiles(path)) as files:
             return FORMAT_NAME.encode() in files.read(MANIFEST_NAME, MAX_MANIFEST_BYTES)

@@ -147,7 +147,7 @@ def split_model(
     path, target = find_model(source), Path(target)
     if is_run_folder(target):
         raise HyrfError(
-            f"{target}: this folder holds a training run, whose model would be read in place of the scene",
+            f"{target}: this folder holds a training run, which would be read in place of the scene",
             fix="name another folder",
         )
     shared_names = _name_shared_files(path)

@@ -65,8 +65,7 @@ def auto_pose(
 
 def _check_run_folder(source: Source, run: Path, *, overwrite: bool) -> None:
     """Check that the run's folder may be written. Raises HyrfError: it is a folder of the source, or holds a run."""
-    for outputs in source.output_rules(overwrite):
-        outputs.folder(run, [MODEL_FILE, CHECKPOINT_FILE, METRICS_FILE])
+    source.output_rules(overwrite).folder(run, [MODEL_FILE, CHECKPOINT_FILE, METRICS_FILE])
 
 
 def _estimate_unless_posed(source: Source, scene: Path, overwrite: bool, context: RunContext) -> None:

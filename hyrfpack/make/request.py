@@ -93,8 +93,7 @@ class Request:
         self._check_options()
         self._check_paths()
         if not self.overwrite and not self.is_output_unchanged(WorkFolderState(self.work)):
-            for outputs in self.source.output_rules(overwrite=False):
-                self._check_output(outputs, overwrite=False)
+            self._check_output(self.source.output_rules(overwrite=False), overwrite=False)
 
     def check_replacing(self, state: WorkFolderState, stage: str, inputs: dict[str, Any]) -> None:
         """Check an existing output before a stage runs again with these inputs.
@@ -196,9 +195,9 @@ class Request:
 
     def _check_paths(self) -> None:
         """Reject an output or a work folder that may not be written, whether or not it exists."""
-        for outputs in self.source.output_rules(overwrite=True):
-            self._check_output(outputs, overwrite=True)
-            outputs.folder(self.work, [RECORD_NAME])
+        outputs = self.source.output_rules(overwrite=True)
+        self._check_output(outputs, overwrite=True)
+        outputs.folder(self.work, [RECORD_NAME])
         work, output = (Path(os.path.realpath(path)) for path in (self.work, self.output))
         if self.source.kind == "photos" and work.is_relative_to(os.path.realpath(self.source.path)):
             raise HyrfError(
@@ -211,7 +210,7 @@ class Request:
             )
 
     def _check_output(self, outputs: Outputs, *, overwrite: bool) -> None:
-        """Check the output by one set of rules."""
+        """Check the output by the rules of the source."""
         if self._is_model:
             outputs.file(self.output, ".hyrf")
         elif self.is_output_folder:

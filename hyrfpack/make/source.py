@@ -119,13 +119,13 @@ class Source:
         masks = locate_masks(self.path)
         return [*list_photos(self.path), *([] if masks is None else list_pictures(masks))]
 
-    def output_rules(self, overwrite: bool) -> list[Outputs]:
-        """Return the rules that protect the source from being overwritten; all of them apply."""
+    def output_rules(self, overwrite: bool) -> Outputs:
+        """Return the rules that protect the source from being overwritten."""
         if self.kind == "photos":
-            folders = sorted({photo.parent for photo in list_photos(self.path)} | {self.path})
-            return [Outputs(folders=folders, overwrite=overwrite)]
+            folders = {photo.parent for photo in list_photos(self.path)} | {self.path}
+            return Outputs(folders=folders, overwrite=overwrite)
         folder = self.path.parent if self.path.name == SOG_META_NAME else self.path
-        return [Outputs(self.path, folders=[folder], scene=self.scene, overwrite=overwrite)]
+        return Outputs(self.path, folders=[folder], scene=self.scene, overwrite=overwrite)
 
 
 def _list_names(folder: Path) -> list[str] | None:

@@ -46,7 +46,7 @@ class Job:
     Attributes:
         images: folder of the photos.
         work: folder of intermediate products.
-        names: photo names, sorted; image n of the database is names[n - 1].
+        names: photo names, sorted with numbers in their order; image n of the database is names[n - 1].
         devices: cameras; camera n of the database is devices[n - 1].
         device_indices: index of each photo's camera in `devices`.
         masks: path of the mask by photo name, for photos that have one.

@@ -28,7 +28,7 @@ from hyrfpack.poses.owned_files import (
     unchanged_files,
 )
 
-_PRODUCTS_VERSION = 5  # products in progress of another version are discarded
+_PRODUCTS_VERSION = 6  # products in progress of another version are discarded
 _FINGERPRINT_NAME = "fingerprint"  # this file identifies the photos and settings of the products in progress
 
 

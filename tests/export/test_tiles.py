@@ -272,5 +272,7 @@ def test_tiles_that_spz_cannot_hold_are_refused_before_the_bake(tmp_path, monkey
     monkeypatch.setattr(pipeline, "bake_levels", None)
     config = hyrfpack.ExportConfig(tiles_3d=True, tile_content="spz")
 
-    with pytest.raises(HyrfError, match="units from the origin of the tiles.*use `tile_content='gltf'`"):
+    with pytest.raises(
+        HyrfError, match="units from the origin of the tiles.*use `tile_content='gltf'`, or .*'hyrfpack edit'"
+    ):
         hyrfpack.export_model(GOLDEN_PARTS_SCENE_FOLDER, tmp_path / "tiles", config, context=QUIET_CONTEXT)

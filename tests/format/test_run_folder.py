@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from scenes import small_model
 
 import hyrfpack
 from hyrfpack.errors import HyrfFormatError
+from hyrfpack.format import run_folder as run_folder_module
 from hyrfpack.format.run_folder import find_model, is_run_folder, read_run_status
 from hyrfpack.format.scene_folder import is_scene
 from hyrfpack.splats.files import read_splats
@@ -76,6 +78,27 @@ def test_the_model_of_a_run_comes_before_a_scene_in_its_folder(run_folder):
     assert is_scene(run_folder / "scene.json")
     assert len(hyrfpack.load_model(run_folder)) == hyrfpack.describe_file(run_folder)["gaussians"]
     assert len(hyrfpack.load_model(run_folder)) == len(GAUSSIAN_POSITIONS)
+
+
+@pytest.mark.parametrize("name", ["checkpoint.pt", "pilots.json"])
+def test_an_unfinished_run_comes_before_a_scene_of_an_older_model_in_its_folder(tmp_path, name):
+    shutil.copytree(GOLDEN_SCENE_FOLDER, tmp_path, dirs_exist_ok=True)
+    (tmp_path / name).write_text("{}")
+
+    assert not is_scene(tmp_path)
+    for call in (find_model, hyrfpack.load_model, hyrfpack.describe_file):
+        with pytest.raises(HyrfFormatError, match="the run has not finished"):
+            call(tmp_path)
+
+
+def test_a_manifest_that_may_not_be_read_is_a_clear_error(tmp_path, monkeypatch):
+    shutil.copytree(GOLDEN_SCENE_FOLDER, tmp_path, dirs_exist_ok=True)
+    manifest = tmp_path / "scene.json"
+    monkeypatch.setattr(run_folder_module, "is_scene_manifest", lambda _: False)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != manifest or mode != os.R_OK)
+
+    with pytest.raises(HyrfFormatError, match="scene.json: permission to read the file is denied; check its"):
+        find_model(tmp_path)
 
 
 @pytest.mark.parametrize("text", ["", '{"metadata": {"version": 4.5}}'])
