@@ -230,7 +230,8 @@ class _BlockRun:
                     with catch_stop_signals(self.context.stop) as stop:
                         result = self._train_block(block, config, stop)
                 steps, trained = steps + result.step, True
-                if not result.complete or stop():  # A signal in the last step lets the block finish.
+                is_left = any(not self.journal.is_finished(other.name) for other in self.plan.blocks)
+                if not result.complete or (is_left and stop()):  # A signal in the last step lets the block finish.
                     return TrainResult(False, steps, None, {})
             # Other processes are training what is left, or deciding its settings. If one of them ends, its claim ends.
             if not trained:

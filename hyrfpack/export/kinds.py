@@ -265,9 +265,7 @@ def check_model(loaded: Source, kind: FileKind, config: ExportConfig) -> None:
             raise HyrfError(
                 f"the Gaussians reach {reach:,.0f} units from the origin of the tiles, but SPZ is limited to "
                 f"{spz.MAX_COORDINATE:,}",
-                fix=(
-                    "use `tile_content='gltf'`, or leave out the far Gaussians with 'hyrfpack edit' and split its result"
-                ),
+                fix="use `tile_content='gltf'`, or remove the far Gaussians with 'hyrfpack edit' and split its result",
             )
     reach, limit = float(np.abs(positions).max()), f"but {kind.ending} is limited to {kind.max_coordinate:,}"
     if reach > kind.max_coordinate:

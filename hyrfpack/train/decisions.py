@@ -85,7 +85,10 @@ def chosen_steps(scene: Scene, config: TrainConfig, steps: object, asked_steps: 
 
 
 def max_pilot_steps(scene: Scene, config: TrainConfig) -> float:
-    """Return the most steps that all pilots of a run take; on reduced photos a step counts less, see `Fold`."""
+    """Return the most steps that all pilots of a run take, see `max_exposure_pilot_steps`.
+
+    On reduced photos a step counts less, see `Fold`.
+    """
     budget = MAX_BUDGET_PILOT_STEPS * measures_budget(scene, config)
     exposure = max_exposure_pilot_steps(len(scene.train), config.steps) * measures_exposure(scene, config)
     length = max_length_pilot_steps(len(scene.train), config.steps) * config.early_stop
@@ -95,7 +98,8 @@ def max_pilot_steps(scene: Scene, config: TrainConfig) -> float:
 def max_exposure_pilot_steps(count: int, steps: int) -> float:
     """Return the most steps that the pilots for exposure take before a run of `steps` steps on `count` photos.
 
-    Steps on reduced photos count less, see `Fold`.
+    Masks and photos of one position may take further rounds, which are not counted. Steps on reduced photos count less,
+    see `Fold`.
     """
     return 2 * exposure_rounds(count) * exposure_pilot_steps(steps) * pilot_step_cost(EXPOSURE_PILOT_REDUCTION)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from hyrfpack.train.exposure import describe_exposure_spread, estimate_exposure_spread
-from hyrfpack.train.pilots import ScenePilots
+from hyrfpack.train.pilots import ScenePilots, count_folds
 
 # Each pilot takes this share of the run's steps, within limits. Short pilots underestimate the gain of long runs, by up
 # to 3.9 dB with 12 photos. The longer a model without gains trains, the more its view-dependent colours fit each
@@ -47,7 +47,7 @@ def exposure_pilot_steps(steps: int) -> int:
 
 
 def exposure_rounds(count: int) -> int:
-    """Return the largest number of rounds of two pilots that a scene without masks or shared positions needs.
+    """Return the largest number of rounds of two pilots that a scene needs, unless masks or shared positions ask for more.
 
     Each round has another seed and another fold, so that scenes of few photos take more rounds.
 
@@ -67,8 +67,8 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
     `LARGE_EXPOSURE_SPREAD_STOPS`, per-image gains are learnt unless the pilots lose more than `MAX_EXPOSURE_LOSS_DB`.
     Elsewhere they are learnt if the pilots gain at least `MIN_EXPOSURE_GAIN_DB` and at least `MIN_GAIN_STANDARD_ERRORS`
     times the standard error. The rounds end early if the mean gain is clear, or not positive where the photos differ
-    little. If masks or shared positions leave fewer than `MIN_EXPOSURE_VALIDATION_VIEWS` photos to score in all folds,
-    no gains are learnt, which is the safe default.
+    little, and go on to all folds while there are fewer than `MIN_EXPOSURE_VALIDATION_VIEWS` photos to score. If masks
+    leave fewer in all folds, no gains are learnt, which is the safe default.
 
     Returns:
         Whether to learn per-image gains, and the reason in words.
@@ -81,9 +81,10 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
         return False, describe_exposure_spread(spread)
     is_large = spread >= LARGE_EXPOSURE_SPREAD_STOPS
     limit = -MAX_EXPOSURE_LOSS_DB if is_large else MIN_EXPOSURE_GAIN_DB
-    rounds, steps = exposure_rounds(len(pilots.scene.train)), exposure_pilot_steps(pilots.config.steps)
+    folds, steps = count_folds(pilots.scene.train, EXPOSURE_VALIDATION_EVERY), exposure_pilot_steps(pilots.config.steps)
+    rounds = min(exposure_rounds(len(pilots.scene.train)), folds)
     gains: list[float] = []  # The PSNR gain of each validation photo in dB.
-    for number in range(EXPOSURE_VALIDATION_EVERY):
+    for number in range(folds):
         if number >= rounds and len(gains) >= MIN_EXPOSURE_VALIDATION_VIEWS:
             break
         gains += _gain_per_view(pilots, number, max(rounds, number + 1), steps)
@@ -95,10 +96,7 @@ def measure_exposure(pilots: ScenePilots) -> tuple[bool, str]:
                 break
     is_loss = len(gains) > 1 and not is_large and np.mean(gains) <= 0
     if len(gains) < MIN_EXPOSURE_VALIDATION_VIEWS and not is_loss:
-        return False, (
-            f"masks or shared positions leave {len(gains)} of the validation photos, too few to measure whether gains "
-            "help"
-        )
+        return False, f"masks leave {len(gains)} of the validation photos, too few to measure whether gains help"
     gain, error = _mean_and_standard_error(gains)
     needed = limit if is_large else max(limit, MIN_GAIN_STANDARD_ERRORS * error)
     return gain >= needed, (

@@ -259,7 +259,7 @@ def split(
         every: the photos of one in `every` places are validation photos; None for 8, or 5 if there are fewer than 16
             places.
         max_validation: largest number of validation photos.
-        number: number of the fold, from 0. Folds 0 to `every` - 1 have no validation photo in common.
+        number: number of the fold, from 0. The first `count_folds` have no validation photo in common.
     """
     places = _group_by_place(views)
     every = min(every or (8 if len(places) >= 16 else 5), len(places))
@@ -268,6 +268,11 @@ def split(
     left_out = {n for place in tested if not set(chosen).isdisjoint(place) for n in place}
     others = sorted(set(range(len(views))) - left_out, key=lambda n: min(abs(n - other) for other in chosen))
     return [views[n] for n in sorted(others[:MAX_TRAINING_VIEWS])], [views[n] for n in chosen]
+
+
+def count_folds(views: Sequence[View], every: int) -> int:
+    """Return the number of folds of `split` that have no validation photo in common; less than `every` for few places."""
+    return min(every, len(_group_by_place(views)))
 
 
 def _group_by_place(views: Sequence[View]) -> list[list[int]]:

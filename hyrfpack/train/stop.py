@@ -21,12 +21,11 @@ def catch_stop_signals(stop: Callable[[], bool] | None = None) -> Iterator[Calla
     """Turn the first Ctrl-C, SIGTERM or SIGHUP into a request to stop; a second Ctrl-C or SIGTERM takes effect at once.
 
     Signals that the parent process ignores stay ignored: SIGHUP under nohup, Ctrl-C in the background of a script. A
-    second SIGHUP has no effect, because closing a terminal sends two: one by the shell and one by the terminal.
+    second SIGHUP has no effect, because closing a terminal sends two: one by the shell and one by the terminal. Blocks
+    may be nested: a signal within the inner one is a request in both.
 
     Args:
         stop: returns whether something else than a signal has asked to stop.
-
-    Blocks may be nested: a signal within the inner one is a request in both.
 
     Yields:
         A function that returns whether a stop was requested.
@@ -60,4 +59,5 @@ def catch_stop_signals(stop: Callable[[], bool] | None = None) -> Iterator[Calla
         yield is_requested
     finally:
         for number, handler in previous.items():
-            signal.signal(number, handler)
+            if signal.getsignal(number) is handle:  # Otherwise a request has restored what the next signal does.
+                signal.signal(number, handler)

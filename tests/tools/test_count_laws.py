@@ -75,5 +75,13 @@ def test_a_row_with_other_weights_of_lpips_is_measured_again(tmp_path):
     measured = replace(row(400, 1000, 20.0, 10_000, 0.25), lpips_weights=str(weights.resolve()))
     (tmp_path / ROW_FILE).write_text(json.dumps(asdict(measured)))
 
+    run = tmp_path / "400" / "1000"
+    run.mkdir(parents=True)
+    (run / ROW_FILE).write_text(json.dumps(asdict(measured)))
+    reuse.write_origin(run, describe_run(tmp_path / "data", 3000, 400, 1000))
+
+    for asked, expected in ((weights, 0.25), (tmp_path / "vgg.pth", None), (None, None)):
+        (kept,) = read_rows(tmp_path, tmp_path / "data", 3000, asked)
+        assert kept.lpips == expected
     assert has_row(tmp_path, None) and has_row(tmp_path, weights)
     assert not has_row(tmp_path, tmp_path / "vgg.pth")

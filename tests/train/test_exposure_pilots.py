@@ -110,9 +110,7 @@ def test_too_few_unmasked_validation_photos_decide_nothing(scores, monkeypatch, 
     decision, reason = measure_exposure(
         ScenePilots(dataclasses.replace(scene, train=views), LONG_CONFIG, PictureCache(), CPU_DEVICE)
     )
-    assert decision is False and reason.startswith(
-        f"masks or shared positions leave {left} of the validation photos, too few"
-    )
+    assert decision is False and reason.startswith(f"masks leave {left} of the validation photos, too few")
 
 
 def test_a_loss_that_ends_the_rounds_early_is_the_reason_also_of_few_validation_photos(scores, monkeypatch):
@@ -178,13 +176,28 @@ def test_few_photos_take_more_folds_so_that_six_photos_validate(scores, monkeypa
     assert len(set(names)) == len(names) >= 6
 
 
-def test_photos_at_one_position_take_a_further_fold(scores, monkeypatch):
-    """Photos of one position are in one fold, so that three folds may hold fewer than six photos."""
+@pytest.mark.parametrize(("positions", "folds"), [((0, 1, 2, 3, 3, 3, 3, 3, 3), 4), ((0, 0, 0, 1, 1, 1, 2, 2, 2), 3)])
+def test_photos_that_share_positions_validate_once_and_in_further_folds(monkeypatch, positions, folds):
+    """Photos of one position are in one fold, so that other folds may hold few photos."""
     monkeypatch.setattr(exposure_pilots, "estimate_exposure_spread", lambda *_: 1.0)
-    scores |= {False: [20.0] * 4, True: [21.0] * 4}
-    monkeypatch.setattr(exposure_pilots, "_gain_per_view", lambda pilots, number, *_: [1.0] * (6 if number == 3 else 1))
-    decision, reason = measure_exposure(ScenePilots(make_scene(9), LONG_CONFIG, PictureCache(), CPU_DEVICE))
-    assert decision and "on 9 validation photos" in reason
+    scene = make_scene(9)
+    poses = [scene.train[number].camera.camera_from_world for number in positions]
+    views = [
+        dataclasses.replace(view, camera=dataclasses.replace(view.camera, camera_from_world=pose))
+        for view, pose in zip(scene.train, poses, strict=True)
+    ]
+    validated: list[list[str]] = []
+
+    def gain(pilots: ScenePilots, number: int, *_: object) -> list[float]:
+        fold = pilots.fold(exposure_pilots.EXPOSURE_VALIDATION_EVERY, 16, number)
+        validated.append([view.name for view in fold.validation])
+        return [1.0 + 0.5 * (-1) ** n for n in range(len(fold.validation))]
+
+    monkeypatch.setattr(exposure_pilots, "_gain_per_view", gain)
+    runs = ScenePilots(dataclasses.replace(scene, train=views), LONG_CONFIG, PictureCache(), CPU_DEVICE)
+    decision, _ = measure_exposure(runs)
+    names = [name for fold in validated for name in fold]
+    assert decision and len(validated) <= folds and 6 <= len(set(names)) == len(names)
 
 
 @pytest.mark.parametrize(

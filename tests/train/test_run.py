@@ -302,14 +302,17 @@ def test_the_first_interrupt_requests_a_stop_and_the_second_interrupts():
 
 
 @pytest.mark.usefixtures("signals")
-def test_a_signal_in_an_inner_block_is_a_request_in_the_outer_one_and_the_second_interrupts():
+@pytest.mark.parametrize("is_within", [True, False])
+def test_a_signal_in_an_inner_block_is_a_request_in_the_outer_one_and_the_second_interrupts(is_within):
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt), catch_stop_signals() as outer:
         with catch_stop_signals() as inner:
             assert not inner() and not outer()
             signal.raise_signal(signal.SIGINT)
             assert inner() and outer()
-            signal.raise_signal(signal.SIGINT)
+            if is_within:
+                signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before
 
 

@@ -17,6 +17,7 @@
 //         and, after another address, for an element whose `camera` or `src` was changed meanwhile
 //     `failing`: the camera with which an element resumes its own scene after another could not be loaded; and the
 //         addresses that it opens when it resumes a scene of a script, which is missing, and when it resumes again
+//     `corrected`: the address that an element opens after a wrong attribute was corrected, with a scene of a script
 //     `frame`: how many frames were made at first, and by the same `src` after an error and after a load
 
 const addresses = [], frames = [], listeners = [];
@@ -226,6 +227,16 @@ for (const isMissing of [true, false]) {
   await wait();
 }
 result.failing = resumed;
+
+const corrected = await connect({ src: "own.hyrf" });
+corrected.viewer.load("other.hyrf").catch(() => {});
+showLast(corrected.viewer);
+for (const interaction of ["allways", "always"]) {
+  corrected.setAttribute("interaction", interaction);
+  await wait();
+  corrected.view.open();
+}
+result.corrected = addresses.at(-1);
 
 const framed = await connect({ src: "a.hyrf", player: "index.html", frame: "" });
 const send = (hyrf) => listeners.at(-1)({ source: frames.at(-1), data: { hyrf, message: "" } });

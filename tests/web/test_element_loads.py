@@ -70,3 +70,7 @@ def test_a_frame_is_made_again_by_the_same_src_only_after_an_error(loads: dict):
 
 def test_a_suspended_element_comes_back_with_what_it_showed_and_else_with_its_own_scene(loads: dict):
     assert loads["failing"] == ["its camera", "other.hyrf", "own.hyrf"]
+
+
+def test_a_wrong_attribute_that_is_corrected_keeps_the_scene_of_a_script(loads: dict):
+    assert loads["corrected"] == "other.hyrf"

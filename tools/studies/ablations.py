@@ -35,6 +35,7 @@ from hyrfpack.ops.rasterize import shaded
 from hyrfpack.render import renderer
 from hyrfpack.scene import Scene, View, evenly_spaced
 from hyrfpack.train import TrainConfig
+from hyrfpack.train.provenance import training_background_spacing
 from tools.command import run_command
 from tools.json_files import write_json
 from tools.studies.ablation_models import FULL_VARIANT, NO_CULLING_VARIANT, TRAINED_VARIANTS, Variant, build_trainer
@@ -65,7 +66,7 @@ def train_and_measure(
         The numbers of one row for JSON, or {"failed": reason} if training failed.
     """
     if variant is NO_CULLING_VARIANT:
-        full = load_model(full_path).requires_grad_()  # then its size includes all parameters
+        full = _load_full_model(full_path, scene).requires_grad_()  # then its size includes all parameters
         return measure(variant, full, full, scene)
     trainer = build_trainer(scene, config, variant, cache)
     try:
@@ -79,10 +80,15 @@ def train_and_measure(
         getattr(trainer.model.gaussians, name).requires_grad_(False)  # its size does not include them
     if variant is FULL_VARIANT:
         save_model(trainer.model, full_path)
-    full = load_model(full_path)
-    full.copy_settings(trainer.model)  # The file has no cameras, so both would draw the background at other places.
-    result = measure(variant, trainer.model, full, scene)
+    result = measure(variant, trainer.model, _load_full_model(full_path, scene), scene)
     return {**result, "steps_per_second": config.steps / trainer.elapsed, "seconds": trainer.elapsed}
+
+
+def _load_full_model(path: Path, scene: Scene) -> HybridModel:
+    """Load the full model. Its file has no cameras, without which it would draw the background at every pixel."""
+    model = load_model(path)
+    model.background_spacing = training_background_spacing(scene)
+    return model
 
 
 @torch.no_grad()

@@ -29,5 +29,5 @@ def train_completely(
     """
     result = hyrfpack.train_model(scene, out, config, resume=resume, overwrite=not resume, context=context)
     if not result.complete:
-        raise SystemExit(f"{out}: the training was stopped, so it is not measured")
+        raise SystemExit(f"{out}: the training was stopped, so it is not measured; run the same command again")
     return result

@@ -3,8 +3,8 @@
     python -m tools.studies.count_laws --sets mipnerf360_bonsai --sizes 400 200 --counts 8000 16000 32000 64000
     python -m tools.studies.count_laws --table --survey results          prints the table, and writes CSV files
 
-Runs are kept in --out/SET/STEPS/SIZE/COUNT. Those of this version that are there are not repeated, unless
---lpips-weights are given and a run has no LPIPS.
+Runs are kept in --out/SET/STEPS/SIZE/COUNT. Those of this version that are there are not trained again, and not scored
+again unless --lpips-weights are given and a run has no LPIPS of these weights.
 
 The first table has one row for each run: PSNR (dB) and SSIM of the compact file on held-out photos, its bytes, and its
 bits per Gaussian of positions, of the other properties, of the hash tables, and of decoders and metadata. The second
@@ -108,18 +108,21 @@ def describe_run(data: Path, steps: int, size: int, count: int) -> Origin:
     return describe_origin(data, size=size, count=count, steps=steps)
 
 
-def read_rows(out: Path, data: Path, steps: int) -> list[CountRow]:
+def read_rows(out: Path, data: Path, steps: int, lpips_weights: Path | None = None) -> list[CountRow]:
     """Return the rows of all runs below `out`, by size, the largest first, and by number of Gaussians.
 
-    Runs of another version or data set are named and left out, because one law does not describe both.
+    Runs of another version or data set are named and left out, because one law does not describe both. LPIPS of other
+    weights is left out, too.
     """
+    weights = None if lpips_weights is None else str(lpips_weights.resolve())
     rows = []
     for path in sorted(out.glob(f"*/*/{ROW_FILE}")):
         size, count = (int(folder.name) for folder in (path.parents[1], path.parent))
         if differences := find_differences(path.parent, describe_run(data, steps, size, count)):
             print(f"{path.parent} is left out: {'; '.join(differences)}", file=sys.stderr)
         else:
-            rows.append(CountRow(**json.loads(path.read_text())))
+            row = CountRow(**json.loads(path.read_text()))
+            rows.append(row if row.lpips_weights == weights else replace(row, lpips=None, lpips_weights=None))
     return sorted(rows, key=lambda row: (-row.size, row.gaussians))
 
 
@@ -187,7 +190,7 @@ def main() -> None:
                 remove_outdated(folder, describe_run(args.data / name, args.steps, size, count))
                 if not has_row(folder, args.lpips_weights):
                     measure(args.data / name, size, count, args.steps, folder, args.lpips_weights)
-        rows = read_rows(out, args.data / name, args.steps)
+        rows = read_rows(out, args.data / name, args.steps, args.lpips_weights)
         print(f"{name}\n\n{format_rows(rows)}\n\n{format_fits(rows)}\n")
         if args.survey:
             write_survey(rows, args.survey, name)

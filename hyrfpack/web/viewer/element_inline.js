@@ -76,10 +76,12 @@ export class InlineView {
   // scene is still shown.
   keepScene() {
     const { currentLoad, isCurrentShown, cameraText } = this.viewer ?? {};
-    if (this.isLoadFailed && !isCurrentShown) this.suspended = null;
-    if (!currentLoad || (this.isLoadFailed && !isCurrentShown)) return;
-    const { source, name, firstCamera } = currentLoad;
-    this.suspended = source && { src: source, name, camera: isCurrentShown ? cameraText : firstCamera };
+    if (this.viewer && this.isLoadFailed && !isCurrentShown) {
+      this.suspended = null;
+    } else if (currentLoad) {
+      const { source, name, firstCamera } = currentLoad;
+      this.suspended = source && { src: source, name, camera: isCurrentShown ? cameraText : firstCamera };
+    }
   }
 
   // Makes the next update load the scene again if its load has failed, or if files of it are missing.
