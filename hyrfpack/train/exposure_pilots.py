@@ -47,9 +47,10 @@ def exposure_pilot_steps(steps: int) -> int:
 
 
 def exposure_rounds(count: int) -> int:
-    """Return the largest number of rounds of two pilots that a scene needs, unless masks or shared positions ask for more.
+    """Return the largest number of rounds of two pilots that a scene needs.
 
-    Each round has another seed and another fold, so that scenes of few photos take more rounds.
+    Each round has another seed and another fold, so that scenes of few photos take more rounds. Masks and photos of one
+    position may take further ones.
 
     Args:
         count: number of training photos.

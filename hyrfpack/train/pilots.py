@@ -271,7 +271,7 @@ def split(
 
 
 def count_folds(views: Sequence[View], every: int) -> int:
-    """Return the number of folds of `split` that have no validation photo in common; less than `every` for few places."""
+    """Return how many folds of `split` have no validation photo in common: `every`, or fewer for few places."""
     return min(every, len(_group_by_place(views)))
 
 
