@@ -45,9 +45,9 @@ def test_counts_are_measured_again_for_other_steps_or_versions_and_for_a_missing
     def measure(data, size, count, steps, folder, lpips_weights):
         folder.mkdir(parents=True, exist_ok=True)
         calls.append((steps, lpips_weights is not None))
-        lpips = None if lpips_weights is None else 0.5
-        found = count_laws.CountRow(size, count, 1000, 20.0, 0.5, lpips, positions=4, properties=3, tables=2, rest=1)
-        (folder / count_laws.ROW_FILE).write_text(json.dumps(asdict(found)))
+        lpips, weights = (None, None) if lpips_weights is None else (0.5, str(lpips_weights.resolve()))
+        row = count_laws.CountRow(size, count, 1000, 20.0, 0.5, lpips, 4, 3, 2, 1, lpips_weights=weights)
+        (folder / count_laws.ROW_FILE).write_text(json.dumps(asdict(row)))
 
     monkeypatch.setattr(count_laws, "measure", measure)
     lpips = ["--lpips-weights", "w.pth"]
