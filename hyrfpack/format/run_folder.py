@@ -108,9 +108,9 @@ def find_model(path: str | os.PathLike[str]) -> Path:
         return manifest
     if not os.access(path, os.X_OK):
         raise HyrfFormatError(f"{path}: permission to read the folder is denied", fix="check its permissions")
-    if _has_file(path, SCENE_MANIFEST_FILE) and not os.access(manifest, os.R_OK):
-        raise HyrfFormatError(f"{manifest}: permission to read the file is denied", fix="check its permissions")
     if _has_file(path, SCENE_MANIFEST_FILE):
+        if not os.access(manifest, os.R_OK):
+            raise HyrfFormatError(f"{manifest}: permission to read the file is denied", fix="check its permissions")
         raise HyrfFormatError(
             f"{manifest}: this is not the manifest of a scene folder, and there is no {MODEL_FILE}",
             fix="name a .hyrf file, or copy the whole folder of the scene again",

@@ -89,8 +89,9 @@ def measure(data: Path, size: int, count: int, steps: int, folder: Path, lpips_w
     }
     total = report.bytes_after
     rest = total - sum(parts.values())
-    row = CountRow(size, report.gaussians, total, scores.psnr, scores.ssim, scores.lpips, **parts, rest=rest)
-    row = replace(row, lpips_weights=None if lpips_weights is None else str(lpips_weights.resolve()))
+    measured = (scores.psnr, scores.ssim, scores.lpips)
+    weights = describe_weights(lpips_weights)
+    row = CountRow(size, report.gaussians, total, *measured, **parts, rest=rest, lpips_weights=weights)
     write_json(folder / ROW_FILE, asdict(row))
     return row
 
@@ -100,7 +101,12 @@ def has_row(folder: Path, lpips_weights: Path | None) -> bool:
     path = folder / ROW_FILE
     if not path.exists() or lpips_weights is None:
         return path.exists()
-    return json.loads(path.read_text()).get("lpips_weights") == str(lpips_weights.resolve())
+    return json.loads(path.read_text()).get("lpips_weights") == describe_weights(lpips_weights)
+
+
+def describe_weights(path: Path | None) -> str | None:
+    """Return the absolute path of weights of LPIPS as a row stores it; None without weights."""
+    return None if path is None else str(path.resolve())
 
 
 def describe_run(data: Path, steps: int, size: int, count: int) -> Origin:
@@ -114,7 +120,6 @@ def read_rows(out: Path, data: Path, steps: int, lpips_weights: Path | None = No
     Runs of another version or data set are named and left out, because one law does not describe both. LPIPS of other
     weights is left out, too.
     """
-    weights = None if lpips_weights is None else str(lpips_weights.resolve())
     rows = []
     for path in sorted(out.glob(f"*/*/{ROW_FILE}")):
         size, count = (int(folder.name) for folder in (path.parents[1], path.parent))
@@ -122,7 +127,8 @@ def read_rows(out: Path, data: Path, steps: int, lpips_weights: Path | None = No
             print(f"{path.parent} is left out: {'; '.join(differences)}", file=sys.stderr)
         else:
             row = CountRow(**json.loads(path.read_text()))
-            rows.append(row if row.lpips_weights == weights else replace(row, lpips=None, lpips_weights=None))
+            has_weights = row.lpips_weights == describe_weights(lpips_weights)
+            rows.append(row if has_weights else replace(row, lpips=None, lpips_weights=None))
     return sorted(rows, key=lambda row: (-row.size, row.gaussians))
 
 

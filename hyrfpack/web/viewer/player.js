@@ -192,8 +192,8 @@ export class Player extends EventTarget {
     }
   }
 
-  // Rejects the promises of `settled` if no picture is shown and no load is left that could show one. If another load
-  // has replaced this one, that one settles them.
+  // Rejects the promises of a complete picture if none is shown and no load is left that could show one. If another
+  // load has replaced this one, that one resolves or rejects them.
   giveUp(error) {
     if (this.loaded || this.next || error instanceof SupersededError) return;
     this.failure = error;
