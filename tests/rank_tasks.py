@@ -211,6 +211,7 @@ def train_run(ranks: Ranks, out: Path, resume: bool = False, overwrite: bool = F
         overwrite=overwrite,
         context=cpu_context(ranks),
     )
+    assert not result.complete or result.model.is_file(), "a process returned before the model was written"
     return result.complete, result.step, bool(result.metrics)
 
 

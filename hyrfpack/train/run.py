@@ -102,9 +102,10 @@ def train_model(
         log: a file that gets a line of JSON every few steps, and TensorBoard files beside it if that is installed; see
             `hyrfpack.train.log.TrainingLog`. A resumed run appends to it.
         context: device, processes, progress and stop. A run may be resumed on another device; on a GPU sums of
-            gradients vary in their last bits from run to run, which may change the measured budget. Only rank 0 returns
-            metrics. If the launcher restarts the processes, as torchrun does after one has ended, they resume from any
-            checkpoint. Each step of the run is a `StepEvent`; all other work, such as pilot runs, gives `TaskEvent`s.
+            gradients vary in their last bits from run to run, which may change the measured budget. All ranks
+            return when the model is written, and only rank 0 returns metrics. If the launcher restarts the processes,
+            as torchrun does after one has ended, they resume from any checkpoint. Each step of the run is a
+            `StepEvent`; all other work, such as pilot runs, gives `TaskEvent`s.
 
     Raises:
         HyrfError: before the first step, if another call is working in the folder, the folder holds another run, the
@@ -321,11 +322,16 @@ class _Run:
                         TrainingLog(self.log, trainer.steps, trainer.step, self.device, self._replaces)
                     )
                 complete = self._take_steps(trainer, log)
-                if not complete or not self.ranks.is_main:
+                if not complete:
                     if log is not None:
-                        log.end(complete=complete, step=trainer.step)
-                    return TrainResult(complete, trainer.step, self.out / MODEL_FILE if complete else None, {})
-                record = save_model(trainer, self.out, self.progress, overwrite=self._replaces)
+                        log.end(complete=False, step=trainer.step)
+                    return TrainResult(False, trainer.step, None, {})
+                # The other processes wait, because their callers may read the model.
+                record = self.ranks.run_on_main(
+                    partial(save_model, trainer, self.out, self.progress, overwrite=self._replaces)
+                )
+            if not self.ranks.is_main:
+                return TrainResult(True, record.step, self.out / record.model, {})
             config, owns_checkpoint = trainer.config, self._replaces or trainer.saved is not None
             del trainer  # Its memory is free while results are written, and no frame that others keep holds it.
             return finish_run(
