@@ -66,7 +66,7 @@ def _tables(runs: Sequence[Run], names: Sequence[str], ranked: bool) -> list[str
     ]
     notes = ["; ".join(notes) or "-" for notes in find_differing_notes(runs)]
     differing = {
-        "Settings": find_differing_settings(runs),
+        "Other settings": find_differing_settings(runs),
         "Choices": find_differing_choices(runs),
         "Notes": {"from reading the photos": notes} if len(set(notes)) > 1 else {},
     }

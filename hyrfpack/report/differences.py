@@ -12,12 +12,13 @@ ALWAYS_SHOWN_SETTINGS = ("steps", "seed")
 
 
 def find_differing_settings(runs: Sequence[Run]) -> dict[str, list[str]]:
-    """Return, by name, the values of all runs for settings, scene facts and device that differ between runs."""
+    """Return, by name, the values of all runs for the settings and facts that differ between runs."""
     values_of_runs = []
     for run in runs:
         settings = {name: value for name, value in run.settings.items() if name not in ALWAYS_SHOWN_SETTINGS}
-        scene = {f"scene: {name}": value for name, value in run.scene.items()}
-        values_of_runs.append({**dict(_flatten(settings)), **dict(_flatten(scene)), "device": run.device})
+        scene = {f"scene: {name}": value for name, value in _without_repetition(run.scene).items()}
+        run_facts = {"device": run.device, "processes": f"{run.processes:,}"}
+        values_of_runs.append({**dict(_flatten(settings)), **dict(_flatten(scene)), **run_facts})
     return _differing_rows(values_of_runs)
 
 
@@ -77,6 +78,14 @@ def describe_doubts(runs: Sequence[Run], names: Sequence[str], changed: Sequence
             "the sizes or the scene are different."
         )
     return doubts
+
+
+def _without_repetition(scene: Mapping) -> dict:
+    """Return the facts about a scene, whose "reading" repeats some of them, with each of them once."""
+    reading = scene.get("reading")
+    if not isinstance(reading, dict):
+        return dict(scene)
+    return {**scene, "reading": {name: value for name, value in reading.items() if name not in scene}}
 
 
 def _quoted(names: Sequence[str]) -> str:

@@ -69,6 +69,7 @@ class Run:
     settings: dict
     scene: dict
     device: str
+    processes: int
     choices: dict[str, str]
     notes: list[str]
     curve: list[Record]
@@ -155,6 +156,7 @@ def _parse_run(folder: Path, metrics: Any) -> Run:
         settings=settings,
         scene=_read_field(metrics, "scene", dict),
         device=str(metrics.get("device", "")),
+        processes=_read_number(metrics, "processes", int) if "processes" in metrics else 1,
         choices={name: str(reason) for name, reason in _read_field(metrics, "choices", dict).items()},
         notes=list(map(str, _read_field(metrics, "notes", list))),
         curve=curve,

@@ -120,6 +120,20 @@ def test_the_page_shows_all_results_and_only_settings_that_differ(runs, tmp_path
     assert report.bytes == (tmp_path / "page.html").stat().st_size
 
 
+def test_processes_are_shown_if_they_differ_and_the_size_of_photos_once(runs, tmp_path):
+    def change(values: dict) -> None:
+        values["processes"] = 2
+        values["scene"]["max_size"] = values["scene"]["reading"]["max_size"] = 40
+
+    for run, size in zip(runs, (80, 40), strict=True):
+        change_metrics(run, lambda values, size=size: values["scene"].update(max_size=size, reading={"max_size": size}))
+    change_metrics(runs[1], change)
+    hyrfpack.compare_runs(runs, tmp_path / "page.html")
+    page = Page(tmp_path / "page.html")
+    assert page.rows["processes"] == ["1", "2"]
+    assert {name: row for name, row in page.rows.items() if "max size" in name} == {"scene: max size": ["80", "40"]}
+
+
 @pytest.mark.acceptance
 def test_the_best_score_is_marked_where_scores_can_be_compared(runs, tmp_path):
     def best(page: Page) -> list[str]:

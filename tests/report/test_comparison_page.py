@@ -23,7 +23,7 @@ RUN_NAMES = ["first", 'the "other"']
 def make_run(psnr: float) -> Run:
     curve = [Record(step, psnr - 1 / step, 100 * step, float(step)) for step in range(1, 9)]
     return Run(
-        *(Path(), {"model.hyrf": 10}, 5, 1.0, {"steps": 8, "seed": 0}, {}, "cpu", {}, [], curve, psnr, 0.5, None),
+        *(Path(), {"model.hyrf": 10}, 5, 1.0, {"steps": 8, "seed": 0}, {}, "cpu", 1, {}, [], curve, psnr, 0.5, None),
         *([Score("one.png", psnr, 0.5, None), Score("two.png", psnr, 0.5, None)], [], {}, None),
     )
 
