@@ -22,7 +22,7 @@ from hyrfpack.cameras.sampling import (
 )
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.rotations import IDENTITY
-from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, evenly_spaced, is_max_size
+from hyrfpack.scene import DEFAULT_MAX_SIZE, Camera, Scene, View, evenly_spaced, is_max_size
 
 MAX_STORED_CAMERAS = MAX_SAMPLING_CAMERAS
 MIN_COARSE_CAMERAS = 14
@@ -41,6 +41,7 @@ PSNR_BEFORE_EDIT = "an edit"
 PLACEMENT_KEY = "placement"
 
 MISMATCH_REMEDY = "name the photos and poses that it was trained on"
+LEAK_REMEDY = "hold out the same photos as in training, with `test_every`"
 # A stored camera matches a photo's camera that differs from it by no more than these two limits.
 _MAX_MATCH_DISTANCE_SCENE_SCALES = 5 / COARSE_POSE_STEPS_PER_SCENE_SCALE
 _MAX_MATCH_ANGLE_DEGREES = 3.0
@@ -204,7 +205,7 @@ class Capture:
         """
         if self.scene is None:
             return ""
-        differences = self._differences_of_stored_cameras()
+        differences = self._differences_of_stored_cameras(self._views)
         matched = int((differences <= 1).sum())
         if matched >= _MIN_MATCHED_CAMERA_SHARE * len(differences):
             return ""
@@ -221,15 +222,37 @@ class Capture:
 
         1 is the largest difference at which a stored camera matches. Without cameras to compare it is 0.
         """
-        differences = self._differences_of_stored_cameras()
+        differences = self._differences_of_stored_cameras(self._views)
         return float(np.median(differences)) if len(differences) else 0.0
 
-    def _differences_of_stored_cameras(self) -> np.ndarray:
-        """Return how much each stored camera (K,) differs from the most similar one of the scene.
+    @property
+    def leak(self) -> str:
+        """The problem if the model was trained on held-out photos of the scene, as far as stored cameras tell, or "".
+
+        A stored camera is that of a held-out photo if it matches it, and differs from all others at least twice as
+        much.
+        """
+        if self.scene is None or not (self.scene.train and self.scene.test):
+            return ""
+        held_out, others = map(self._differences_of_stored_cameras, (self.scene.test, self.scene.train))
+        leaked = int(((held_out <= 1) & (held_out < others / 2)).sum())
+        if not leaked:
+            return ""
+        return (
+            f"{self.scene.path}: of the {len(held_out)} cameras that the model keeps of its training, {leaked} "
+            f"{'are' if leaked > 1 else 'is'} among those of the held-out photos, so the model was trained on some of "
+            "them and its scores are too high"
+        )
+
+    @property
+    def _views(self) -> list[View]:
+        return [] if self.scene is None else self.scene.views
+
+    def _differences_of_stored_cameras(self, views: Sequence[View]) -> np.ndarray:
+        """Return how much each stored camera (K,) differs from the most similar one of some views.
 
         1 is the largest difference in position or direction at which cameras match. K is 0 if none can be compared.
         """
-        views = [] if self.scene is None else self.scene.views
         try:
             stored = [camera_from_numbers(numbers) for numbers in self._stored_cameras or self._coarse_cameras or ()]
             limit = _MAX_MATCH_DISTANCE_SCENE_SCALES * float(self.facts["config"]["frame"]["scale"])

@@ -96,7 +96,7 @@ def bench(
     model = None if model is None else resolve_model_file(model)
     choose_plot_format(output)
     require_matplotlib()
-    scene = None if data is None or model is None else read_scene(data, reader_options, describe_file(model))
+    scene = None if data is None or model is None else read_scene(data, reader_options, model, describe_file(model))
     folder = None if model is None else find_input_folder(model)
     outputs = Outputs(model, folders=[folder], scene=scene, overwrite=overwrite)
     outputs.file(output)

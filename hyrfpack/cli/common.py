@@ -46,7 +46,7 @@ def scene_options(command: Command) -> Command:
     @functools.wraps(command)
     def with_reader_options(
         *args: Any,
-        test_every: int,
+        test_every: int | None,
         images: str | None,
         max_size: int | None,
         layout: str | None,
@@ -78,11 +78,10 @@ def scene_options(command: Command) -> Command:
         click.option(
             "--test-every",
             type=click.IntRange(min=0),
-            default=8,
-            show_default=True,
             metavar="N",
             help="Hold out every Nth photo, in order of file names, for testing; 0 holds out none. A data set with a "
-            "test split keeps that split.",
+            "test split keeps that split.  [default: 8; with the folder of a run as MODEL, the "
+            "photos that it held out]",
         ),
     ):
         with_options = option(with_options)
@@ -157,38 +156,53 @@ def choose_command_device(name: str, ranks: Ranks | None = None) -> torch.device
 
 
 def read_scene(
-    path: Path, reader_options: dict[str, Any], model: dict | None = None, *, must_match: bool = False
+    path: Path,
+    reader_options: dict[str, Any],
+    model: Path | None = None,
+    facts: dict | None = None,
+    *,
+    must_match: bool = False,
 ) -> Scene:
     """Read a folder of photos and poses, and print the reader's notes.
 
-    The poses are moved as edits have moved the model. A further note says whether it was trained on other photos.
+    The poses are moved as edits have moved the model. Further notes say whether it was trained on other photos, or on
+    some that are held out.
 
     Args:
         path: the folder, or an archive of it.
         reader_options: values of the options of `scene_options`.
-        model: description (`hyrfpack.describe_file`) of the model file that belongs to the photos, if any. It gives the
-            size of the photos if --max-size does not.
+        model: the model file that belongs to the photos, if any. If it is that of a run on them, the run says which
+            photos are held out if --test-every does not.
+        facts: description (`hyrfpack.describe_file`) of the model; None for splats. It gives the size of the photos if
+            --max-size does not.
         must_match: refuse photos that the model was not trained on, because what is written depends on them.
 
     Raises:
         HyrfError: as `hyrfpack.load_scene`, or the photos do not match the model.
     """
-    from hyrfpack.cameras.capture import MISMATCH_REMEDY, Capture, place_photos
+    from hyrfpack.cameras.capture import LEAK_REMEDY, MISMATCH_REMEDY, Capture, place_photos
     from hyrfpack.data import load_scene
-    from hyrfpack.scene import DEFAULT_MAX_SIZE
 
-    if reader_options["max_size"] is None:
-        reader_options = {**reader_options, "max_size": DEFAULT_MAX_SIZE if model is None else Capture(model).max_size}
-    scene = load_scene(path, **reader_options)
+    options = {name: value for name, value in reader_options.items() if value is not None}
+    if facts is not None:
+        options = {"max_size": Capture(facts).max_size, **options}
+    if model is not None and "test_every" not in options:
+        from hyrfpack.train.photos import recorded_split
+
+        options |= recorded_split(model, path)
+    scene = load_scene(path, **options)
     for sentence in scene.notes:
         note(sentence)
-    if model is None:
+    if facts is None:
         return scene
-    scene = place_photos(model, scene)
-    if mismatch := Capture(model, scene).mismatch:
+    scene = place_photos(facts, scene)
+    capture = Capture(facts, scene)
+    if mismatch := capture.mismatch:
         if must_match:
             raise HyrfDataError(mismatch, fix=MISMATCH_REMEDY)
         note(f"{mismatch}; {MISMATCH_REMEDY}")
+    elif leak := capture.leak:
+        note(f"{leak}; {LEAK_REMEDY}")
     return scene
 
 

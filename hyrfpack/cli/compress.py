@@ -102,7 +102,7 @@ def compress(
 
     def read() -> Scene | None:
         if data is not None:
-            scene: Scene | None = read_scene(data, reader_options, describe_file(model), must_match=True)
+            scene: Scene | None = read_scene(data, reader_options, model, describe_file(model), must_match=True)
         else:
             scene = None if no_data or config.profile != "compact" else _load_training_photos(model)
         outputs = Outputs(model, scene=scene, overwrite=overwrite)

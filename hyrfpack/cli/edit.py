@@ -254,7 +254,7 @@ def edit(
     if data is not None:
         facts = describe_file(model)
         edited = next((entry for entry in facts.get("parts", []) if entry["name"] == part), facts)
-        scene = read_scene(data, reader_options, edited, must_match=True)
+        scene = read_scene(data, reader_options, model, edited, must_match=True)
     if plan:
         report = plan_edit(model, actions, part=part, data=scene, picture=picture, overwrite=overwrite)
     else:

@@ -74,7 +74,7 @@ def evaluate(
 
     def read() -> tuple[HybridModel | MergedModel | Drawable, Scene, list[View]]:
         drawn_model = source.load()
-        scene = read_scene(data, reader_options, source.facts)
+        scene = read_scene(data, reader_options, source.path, source.facts)
         views = select_views(scene, split)
         if pictures is not None:
             outputs = Outputs(source.path, lpips_weights, folders=[source.folder], scene=scene, overwrite=overwrite)

@@ -126,7 +126,7 @@ def export(
     files = _find_model_files(models, data, output, kind)
     check_request(kind, output, config)
     scenes = [
-        read_scene(path, reader_options, describe_file(model), must_match=True)
+        read_scene(path, reader_options, model, describe_file(model), must_match=True)
         for path, model in zip(data, files, strict=False)
     ]
     if kind is PLAYER_FOLDER:

@@ -124,7 +124,7 @@ def render(
     has_budget = gaussians is not None or level_bytes is not None
     levels = source.load_levels(gaussians, level_bytes) if has_budget else None
     if data is not None:
-        scene = ranks.run_on_all(lambda: read_scene(data, reader_options, source.facts))
+        scene = ranks.run_on_all(lambda: read_scene(data, reader_options, source.path, source.facts))
         named_cameras = [(view.name, view.camera) for view in select_views(scene, split)]
     else:
         named_cameras = _name_cameras(source, cameras, orbit or DEFAULT_ORBIT_FRAMES)

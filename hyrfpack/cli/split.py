@@ -59,7 +59,7 @@ def split(
     from hyrfpack.format import describe_file
     from hyrfpack.lod import split_model
 
-    scene = None if data is None else read_scene(data, reader_options, describe_file(file), must_match=True)
+    scene = None if data is None else read_scene(data, reader_options, file, describe_file(file), must_match=True)
     report = split_model(model, output, SplitConfig(**settings), data=scene, overwrite=overwrite)
     if as_json:
         print_json(report.to_dict())

@@ -16,7 +16,7 @@ from hyrfpack.data.search import find_only_subfolder
 from hyrfpack.data.unusable import no_photos_error, raise_if_single_photo
 from hyrfpack.errors import HyrfDataError, HyrfError, HyrfNoPosesError, suggest_command
 from hyrfpack.outputs import VIDEO_SUFFIXES
-from hyrfpack.scene import DEFAULT_MAX_SIZE, MIN_MAX_SIZE, Scene, is_max_size
+from hyrfpack.scene import DEFAULT_MAX_SIZE, DEFAULT_TEST_EVERY, MIN_MAX_SIZE, Scene, is_max_size
 
 __all__ = ["LAYOUTS", "PictureCache", "load_scene", "pose_commands"]
 
@@ -24,7 +24,7 @@ __all__ = ["LAYOUTS", "PictureCache", "load_scene", "pose_commands"]
 def load_scene(
     path: str | os.PathLike[str],
     *,
-    test_every: int = 8,
+    test_every: int = DEFAULT_TEST_EVERY,
     images: str | None = None,
     layout: str | None = None,
     model: str | None = None,

@@ -16,12 +16,11 @@ from hyrfpack.data.masks import locate_masks
 from hyrfpack.errors import HyrfDataError, HyrfNoPosesError
 from hyrfpack.make.held_out import choose_inner_view
 from hyrfpack.outputs import PICTURE_SUFFIXES, VIDEO_SUFFIXES, Outputs, StrPath
-from hyrfpack.scene import DEFAULT_MAX_SIZE, Scene
+from hyrfpack.scene import DEFAULT_MAX_SIZE, DEFAULT_TEST_EVERY, Scene
 from hyrfpack.splats.names import SOG_META_NAME, is_sog_folder, is_splats
 
 MIN_SPLIT_PHOTOS = 16  # if there are fewer photos, a single one is held out
 MIN_HELD_OUT_PHOTOS = 8  # if there are fewer photos, none is held out
-DEFAULT_TEST_EVERY = 8
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 from typing import Any
 
 from hyrfpack.counts import format_count
@@ -33,16 +34,11 @@ def load_training_scene(model: str | os.PathLike[str]) -> Scene | None:
         (8, 2)
     """
     model = find_model(model)
-    if model.name != MODEL_FILE:
+    recorded = _read_scene_facts(model)
+    if recorded is None:
         return None
-    try:
-        recorded = json.loads((model.parent / METRICS_FILE).read_text("utf-8"))["scene"]
-        reading, sizes = dict(recorded["reading"]), (recorded["train"], recorded["test"])
-        path = reading.pop("path")
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
-    if not _is_reading(path, reading) or not all(type(size) is int for size in sizes):
-        return None
+    reading, sizes = dict(recorded["reading"]), (recorded["train"], recorded["test"])
+    path = reading.pop("path")
     scene = load_scene(path, **reading)
     if sizes != (len(scene.train), len(scene.test)):
         raise HyrfDataError(
@@ -51,6 +47,32 @@ def load_training_scene(model: str | os.PathLike[str]) -> Scene | None:
             fix="name the photos with `data`",
         )
     return scene
+
+
+def recorded_split(model: Path, photos: Path) -> dict[str, Any]:
+    """Return the arguments of `load_scene` with which a run held photos out: "test_every", and "held_out" if used.
+
+    Args:
+        model: file of a model.
+        photos: folder of photos; empty if the model is not that of a run on this folder.
+    """
+    recorded = _read_scene_facts(model)
+    if recorded is None or os.path.realpath(recorded["reading"]["path"]) != os.path.realpath(photos):
+        return {}
+    return {name: recorded["reading"][name] for name in ("test_every", "held_out") if name in recorded["reading"]}
+
+
+def _read_scene_facts(model: Path) -> dict[str, Any] | None:
+    """Return what the folder of a run records about its photos; None if it is no run, or the record is not valid."""
+    if model.name != MODEL_FILE:
+        return None
+    try:
+        recorded = json.loads((model.parent / METRICS_FILE).read_text("utf-8"))["scene"]
+        reading, sizes = dict(recorded["reading"]), (recorded["train"], recorded["test"])
+        path = reading.pop("path")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return recorded if _is_reading(path, reading) and all(type(size) is int for size in sizes) else None
 
 
 def _is_reading(path: object, options: dict) -> bool:

@@ -211,3 +211,14 @@ def test_without_photos_or_kept_cameras_there_is_no_mismatch():
     assert Capture(make_description(**scene_provenance(scene))).mismatch == ""
     assert Capture(make_description(), scene).mismatch == ""
     assert Capture(make_description(cameras=[["damaged"]]), scene).mismatch == ""
+
+
+def test_a_camera_as_near_to_a_photo_of_training_as_to_a_held_out_one_says_nothing():
+    """Two photos may be taken from one place, as with a bracket of exposures."""
+    cameras, scene = ring(4), ball_scene(4)
+    views = [replace(view, camera=camera) for view, camera in zip(scene.train, cameras, strict=True)]
+    facts = make_description(cameras=provenance_cameras(cameras))
+    assert Capture(facts, replace(scene, train=views[:3], test=views[3:])).leak
+    assert not Capture(facts, replace(scene, train=views, test=views[3:])).leak
+    assert not Capture(facts, replace(scene, train=[], test=views)).leak
+    assert not Capture(make_description(), replace(scene, train=views[:3], test=views[3:])).leak

@@ -1,4 +1,7 @@
-"""Photos that a model was not trained on: scored and rendered with a note, refused where the output depends on them."""
+"""Photos that a model was not trained on, and held-out photos that it was: scored with a note, refused or found again.
+
+Where the output depends on photos that the model was not trained on, they are refused.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,14 @@ from pathlib import Path
 
 import pytest
 from commands import refused, succeeded
-from scenes import small_model
+from scenes import QUIET_CONTEXT, small_model
 
 import hyrfpack
 from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.config.edit import MinOpacity
 from hyrfpack.errors import HyrfDataError
 
+LEAK_NOTE = "among those of the held-out photos, so the model was trained on some of them"
 MISMATCH_NOTE = "another coordinate frame; name the photos and poses that it was trained on"
 
 
@@ -100,3 +104,33 @@ def test_photos_of_the_edited_part_of_a_merged_file_are_accepted_and_others_are_
     succeeded(*command, "other", "--data", data_in_another_frame)
     assert "another coordinate frame" in refused(*command, "model", "--data", data_in_another_frame)
     assert "another coordinate frame" in refused(*command, "other", "--data", data)
+
+
+def test_a_note_says_if_held_out_photos_are_among_those_of_training(model, data, tmp_path):
+    assert LEAK_NOTE not in succeeded("evaluate", model, "--data", data).stderr
+    message = succeeded("evaluate", model, "--data", data, "--test-every", 5).stderr
+    assert message.count(LEAK_NOTE) == 1 and "of the 8 cameras" in message and "1 is among" in message
+    message = succeeded("render", model, "-o", tmp_path / "out", "--data", data, "--test-every", 3).stderr
+    assert message.count(LEAK_NOTE) == 1 and "with --test-every" in message
+
+
+def test_few_rounded_cameras_suffice_to_notice_held_out_photos_of_training(model, data, tmp_path):
+    hyrfpack.compress_model(model, tmp_path / "small.hyrf", data=None)
+    assert LEAK_NOTE not in succeeded("evaluate", tmp_path / "small.hyrf", "--data", data).stderr
+    assert LEAK_NOTE in succeeded("evaluate", tmp_path / "small.hyrf", "--data", data, "--test-every", 3).stderr
+
+
+@pytest.mark.parametrize(
+    ("reading", "names"), [({"test_every": 5}, ["0000.png", "0005.png"]), ({"held_out": ["0004.png"]}, ["0004.png"])]
+)
+def test_a_run_is_scored_on_the_photos_that_it_held_out(reading, names, data, tmp_path):
+    scene, run = hyrfpack.load_scene(data, **reading), tmp_path / "run"
+    hyrfpack.train_model(scene, run, hyrfpack.TrainConfig(steps=2, max_gaussians=60), context=QUIET_CONTEXT)
+    scored = succeeded("evaluate", run, "--data", data, "--json")
+    assert [view["name"] for view in json.loads(scored.stdout)["views"]] == names
+    assert LEAK_NOTE not in scored.stderr
+    copy = Path(shutil.copytree(data, tmp_path / "copy"))
+    for options in (["--data", copy], ["--data", data, "--test-every", 8]):
+        scored = succeeded("evaluate", run, *options, "--json")
+        assert [view["name"] for view in json.loads(scored.stdout)["views"]] == ["0000.png", "0008.png"]
+        assert LEAK_NOTE in scored.stderr
