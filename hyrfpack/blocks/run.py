@@ -119,8 +119,6 @@ def train_blocks(
     config = TrainConfig() if config is None else config
     check_type("config", config, TrainConfig)
     device = context.choose_device()
-    if config.preset == "auto":
-        config = dataclasses.replace(config, preset=detect_preset(scene)[0])
     check_target(scene, config)
     ranks = context.ranks or SINGLE_PROCESS
     _check_processes(ranks, scene, config, blocks)
@@ -136,6 +134,8 @@ def train_blocks(
         return train_model(
             scene, out, config, resume=resume, overwrite=overwrite, observer=observer, log=log, context=context
         )
+    if config.preset == "auto":
+        config = dataclasses.replace(config, preset=detect_preset(scene)[0])
     plan = plan_blocks(scene, columns, rows)
     check_settings(ranks, {f"photos of block {block.name}": names_and_sizes(block.photos) for block in plan.blocks})
     with exclusive_folder(out, ranks=ranks):

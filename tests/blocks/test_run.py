@@ -56,10 +56,11 @@ def test_a_run_in_blocks_leaves_one_model_with_a_part_for_each_block(finished):
 
 
 def test_a_single_block_is_a_run_without_blocks(tmp_path):
-    config = dataclasses.replace(BLOCK_CONFIG, steps=2)
+    config = dataclasses.replace(BLOCK_CONFIG, steps=2, preset="auto")
     result = train_blocks(block_scene(), tmp_path / "run", config, "1x1", context=QUIET_CONTEXT)
     assert result.complete and len(load_model(result.model)) == result.metrics["gaussians"]
     assert not is_begun(tmp_path / "run")
+    assert "asked for" not in result.metrics["choices"]["preset"]  # It is still the scene that decides.
 
 
 def test_a_new_run_in_blocks_removes_the_checkpoint_of_a_run_without_blocks(tmp_path):
