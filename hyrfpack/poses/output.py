@@ -210,10 +210,7 @@ def explain_disk_errors(out: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise HyrfError(
-                f"{out}: the disk is full",
-                fix="free some space and run the same command again, which resumes here",
-            ) from error
+            raise disk_full_error(out) from error
         if isinstance(error, FileNotFoundError):
             raise HyrfError(
                 f"{error.filename or out}: this file or folder was removed or moved during the estimation",
@@ -223,3 +220,10 @@ def explain_disk_errors(out: Path) -> Iterator[None]:
             f"{error.filename or out}: this file or folder cannot be read or written ({error.strerror or error})",
             fix="check the folder's permissions and the disk",
         ) from error
+
+
+def disk_full_error(folder: Path) -> HyrfError:
+    """Return the error of a full disk, on which a folder lies that keeps the work of an interrupted call."""
+    return HyrfError(
+        f"{folder}: the disk is full", fix="free some space and run the same command again, which resumes here"
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from contextlib import suppress
@@ -13,9 +14,11 @@ from typing import Any
 
 from hyrfpack.errors import HyrfDataError, HyrfError
 from hyrfpack.parallel.child_items import child_environment, signal_name
+from hyrfpack.poses.output import disk_full_error
 from hyrfpack.progress import Progress, TaskEvent
 
 MAX_SILENCE_SECONDS = 2.0  # the last message is reported again after this time, so that a display keeps updating
+MIN_FREE_BYTES = 1 << 20  # a disk with less free space is full
 _TERMINATION_TIMEOUT_SECONDS = 3.0  # a process that takes longer to terminate is killed
 _STAGE_DESCRIPTIONS = {
     "features": "finding features",
@@ -48,7 +51,8 @@ def run_stage(job: Path, stage: str, report_progress: Progress, *arguments: str)
 
     Raises:
         HyrfDataError: the stage rejected the photos.
-        StageCrashedError: the process ended without an answer: the library crashed or ran out of memory or disk space.
+        StageCrashedError: the process ended without an answer: the library crashed or ran out of memory.
+        HyrfError: the disk is full, or a file cannot be read or written.
     """
     command = [sys.executable, "-m", "hyrfpack.poses.worker", str(job), stage, *arguments]
     log = job.parent / f"{stage}.log"
@@ -72,6 +76,9 @@ def run_stage(job: Path, stage: str, report_progress: Progress, *arguments: str)
     if "refused" in answer:
         problem, fix = answer["refused"]
         raise HyrfDataError(problem, fix=fix)
+    if "failed" in answer:
+        problem, fix = answer["failed"]
+        raise HyrfError(problem, fix=fix)
     if code or not answer:
         raise _crash_error(stage, code, log)
     return answer
@@ -125,14 +132,13 @@ def _terminate(process: subprocess.Popen) -> None:
                 pipe.close()
 
 
-def _crash_error(stage: str, code: int, log: Path) -> StageCrashedError:
+def _crash_error(stage: str, code: int, log: Path) -> HyrfError:
     """Return the error that states why a process ended without an answer, from its exit code and its log."""
     doing = _STAGE_DESCRIPTIONS.get(stage, _FINISH_DESCRIPTION)
     text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
-    if "disk is full" in text or "No space left" in text or "disk I/O error" in text:
-        return StageCrashedError(
-            f"{log.parent}: the disk is full", fix="free some space and run the same command again, which resumes here"
-        )
+    is_disk_full = shutil.disk_usage(log.parent).free < MIN_FREE_BYTES  # Then the log is empty.
+    if is_disk_full or any(words in text for words in ("disk is full", "No space left", "disk I/O error")):
+        return disk_full_error(log.parent)
     if "MemoryError" in text or "bad_alloc" in text or (code < 0 and signal_name(code) == "SIGKILL"):
         return StageCrashedError(
             f"{log.parent}: {doing} needs more memory than is available",

@@ -1,7 +1,8 @@
 """Entry point of the process that runs one stage of an estimation.
 
 The command is `python -m hyrfpack.poses.worker JOB STAGE [MODEL ...]`.
-It writes its progress as lines of JSON to standard output; the last line is the answer. It ends when its parent process
+It writes its progress as lines of JSON to standard output; the last line is the answer: that of the stage, or an error,
+"refused" if the photos cannot be used, otherwise "failed". It ends when its parent process
 ends, because its standard input is then closed. On Linux the kernel kills it as well, because a long call into pycolmap
 can block every Python thread.
 """
@@ -18,8 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import hyrfpack  # must come first, because it imports zlib before pycolmap  # noqa: F401
-from hyrfpack.errors import HyrfError, needs_package
+from hyrfpack.errors import HyrfDataError, HyrfError, needs_package
 from hyrfpack.poses.job import Job
+from hyrfpack.poses.output import explain_disk_errors
 from hyrfpack.progress import Event, TaskEvent
 
 _output_lock = threading.Lock()  # a second thread reports progress during long calls, see `watch`
@@ -63,10 +65,12 @@ def main(job: str, stage: str, *models: str) -> None:
     """Run one stage of a saved job and send its answer."""
     _exit_with_parent()
     try:
-        with needs_package("estimating poses"):
+        with explain_disk_errors(Path(job).parent), needs_package("estimating poses"):
             answer = run(Job.load(Path(job)), stage, list(models))
-    except HyrfError as error:
+    except HyrfDataError as error:
         answer = {"refused": [error.problem, error.fix]}
+    except HyrfError as error:
+        answer = {"failed": [error.problem, error.fix]}
     send_message({"answer": answer})
 
 

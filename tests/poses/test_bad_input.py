@@ -152,5 +152,5 @@ def test_without_pycolmap_a_stage_says_what_to_install(monkeypatch, capsys):
 
     worker.main("job", "features")
 
-    problem, fix = json.loads(capsys.readouterr().out)["answer"]["refused"]
+    problem, fix = json.loads(capsys.readouterr().out)["answer"]["failed"]
     assert (problem, fix) == ("estimating poses needs pycolmap", "run 'pip install \"hyrfpack[poses]\"'")

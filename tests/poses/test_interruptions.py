@@ -25,8 +25,17 @@ import os, sys
 if sys.orig_argv[-1] == {stage!r} and "hyrfpack.poses.worker" in sys.orig_argv:
     os.abort()
 """
+FULL_DISK_CODE = """
+import sys
+if sys.orig_argv[-1] == "features" and "hyrfpack.poses.worker" in sys.orig_argv:
+    import errno
+    import hyrfpack.poses.features
 
+    def write_on_full_disk(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
 
+    hyrfpack.poses.features._write_working_copy = write_on_full_disk
+"""
 MAPPERS_DISAGREE_CODE = """
 import sys
 if "hyrfpack.poses.worker" in sys.orig_argv:
@@ -165,6 +174,29 @@ def test_a_crash_of_the_library_is_a_clear_error(photos_and_poses, tmp_path, mon
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with pytest.raises(hyrfpack.HyrfError, match="matching photos ended by SIGABRT.*run the same command again"):
         hyrfpack.estimate_poses(photos_and_poses[0], tmp_path / "scene")
+
+
+def test_a_full_disk_while_features_are_sought_keeps_the_work(photos_and_poses, tmp_path, monkeypatch):
+    (tmp_path / "sitecustomize.py").write_text(FULL_DISK_CODE)
+    out = tmp_path / "scene"
+    with monkeypatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(tmp_path))
+        with pytest.raises(hyrfpack.HyrfError, match="the disk is full; free some space.*resumes here") as caught:
+            hyrfpack.estimate_poses(photos_and_poses[0], out)
+    assert not isinstance(caught.value, hyrfpack.HyrfDataError)
+    assert len(list((out / ".poses" / "images").iterdir())) == len(photos_and_poses[1])
+    with pytest.raises(KeyboardInterrupt):
+        hyrfpack.estimate_poses(photos_and_poses[0], out, context=stop_at("matching"))
+    assert (out / ".poses" / "features.json").exists()
+
+
+@pytest.mark.integration
+def test_a_process_that_ends_on_a_full_disk_has_an_empty_log(tmp_path, monkeypatch):
+    (tmp_path / "features.log").touch()
+    assert "ended with code 1" in process._crash_error("features", 1, tmp_path / "features.log").problem
+    monkeypatch.setattr(process.shutil, "disk_usage", lambda folder: shutil._ntuple_diskusage(1 << 30, 1 << 30, 4096))
+    error = process._crash_error("features", 1, tmp_path / "features.log")
+    assert error.problem == f"{tmp_path}: the disk is full" and "resumes here" in error.fix
 
 
 @pytest.mark.integration
