@@ -85,7 +85,7 @@ def _print_photos(path: Path, as_json: bool) -> None:
 
 def _print_run(folder: Path, as_json: bool) -> None:
     from hyrfpack.format import describe_file, read_run_status
-    from hyrfpack.format.run_folder import FINISH_RUN_ADVICE, MODEL_FILE, describe_unfinished_run
+    from hyrfpack.format.run_folder import MODEL_FILE, advise_on_unfinished_run, describe_unfinished_run
 
     run = read_run_status(folder)
     facts = describe_file(folder) if (folder / MODEL_FILE).is_file() else {}
@@ -97,7 +97,8 @@ def _print_run(folder: Path, as_json: bool) -> None:
         seconds = "" if run.seconds is None else f" in {run.seconds:,.0f} s"
         print_line(f"{folder}: a finished training run{steps}{seconds}")
     else:
-        print_line(f"{folder}: {describe_unfinished_run(run)}; {use_option_names(FINISH_RUN_ADVICE)}")
+        advice = use_option_names(advise_on_unfinished_run(folder))
+        print_line(f"{folder}: {describe_unfinished_run(run)}; {advice}")
     if run.photos is not None:
         print_line(f"photos: {run.photos}, {run.train} to train on and {run.test} held out")
     if run.psnr is not None and run.ssim is not None:

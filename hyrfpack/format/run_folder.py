@@ -23,7 +23,8 @@ BLOCKS_JOURNAL_FILE = f"{BLOCKS_FOLDER}/blocks.json"  # see `hyrfpack.blocks.jou
 # The manifest of a scene folder, and the name of its format, see `hyrfpack.format.scene_manifest`.
 SCENE_MANIFEST_FILE, SCENE_FORMAT_NAME = "scene.json", "hyrf-scene"
 MAX_MANIFEST_BYTES = 1 << 24
-FINISH_RUN_ADVICE = "finish it by running its 'hyrfpack train' command again with `resume=True`"
+# The work folder of `hyrfpack make`: the record of its stages, and a model to look at if training was interrupted.
+WORK_RECORD_FILE, PREVIEW_FILE = "make.json", "preview.hyrf"
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,9 @@ def find_model(path: str | os.PathLike[str]) -> Path:
     if _has_file(path, MODEL_FILE):
         return path / MODEL_FILE
     if _is_unfinished_run(path):
-        raise HyrfFormatError(f"{path}: {describe_unfinished_run(read_run_status(path))}", fix=FINISH_RUN_ADVICE)
+        raise HyrfFormatError(
+            f"{path}: {describe_unfinished_run(read_run_status(path))}", fix=advise_on_unfinished_run(path)
+        )
     manifest = path / SCENE_MANIFEST_FILE
     if is_scene_manifest(manifest):
         return manifest
@@ -114,6 +117,12 @@ def find_model(path: str | os.PathLike[str]) -> Path:
         raise HyrfFormatError(
             f"{manifest}: this is not the manifest of a scene folder, and there is no {MODEL_FILE}",
             fix="name a .hyrf file, or copy the whole folder of the scene again",
+        )
+    if _has_file(path, WORK_RECORD_FILE):
+        preview = f", or name {path / PREVIEW_FILE}" if _has_file(path, PREVIEW_FILE) else ""
+        raise HyrfFormatError(
+            f"{path}: this is the work folder of 'hyrfpack make', which writes the model elsewhere",
+            fix=f"name that model; if the command was interrupted, repeat it, which resumes{preview}",
         )
     raise HyrfFormatError(
         f"{path}: this folder holds no {MODEL_FILE}",
@@ -132,8 +141,15 @@ def name_model(path: str | os.PathLike[str]) -> str:
     return Path(os.path.abspath(path)).name if os.path.isdir(path) else Path(path).stem
 
 
+def advise_on_unfinished_run(folder: str | os.PathLike[str]) -> str:
+    """Return a message clause that says how to finish an unfinished run."""
+    if _has_file(os.path.dirname(os.path.abspath(folder)), WORK_RECORD_FILE):
+        return "finish it by repeating its 'hyrfpack make' command, which resumes"
+    return "finish it by running its 'hyrfpack train' command again with `resume=True`"
+
+
 def describe_unfinished_run(run: RunStatus) -> str:
-    """Return a message clause on the progress of an unfinished run; FINISH_RUN_ADVICE says how to finish it."""
+    """Return a message clause on the progress of an unfinished run; `advise_on_unfinished_run` says what to do."""
     progress = "" if run.step is None or run.steps is None else f" (step {run.step:,} of {run.steps:,})"
     return f"the run has not finished{progress}"
 

@@ -11,13 +11,13 @@ from hyrfpack.compress import compress_model
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError
 from hyrfpack.format import describe_file, save_model
+from hyrfpack.format.run_folder import PREVIEW_FILE
 from hyrfpack.make.stage_cache import StageCache
 from hyrfpack.train import Trainer
 from hyrfpack.train.provenance import training_provenance
 
 _LOG = logging.getLogger(__name__)
 
-PREVIEW_FILE = "preview.hyrf"
 _UNCOMPRESSED_FILE = "preview.raw.hyrf"
 
 

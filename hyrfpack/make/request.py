@@ -24,9 +24,10 @@ from hyrfpack.export.kinds import (
     find_file_kind,
 )
 from hyrfpack.format.min_file_size import check_target_bytes
+from hyrfpack.format.run_folder import WORK_RECORD_FILE
 from hyrfpack.make.source import LoadSettings, Source
 from hyrfpack.make.stages import EXPORT_FOLDER, PACKED_MODEL
-from hyrfpack.make.state import RECORD_NAME, WorkFolderState, file_digest
+from hyrfpack.make.state import WorkFolderState, file_digest
 from hyrfpack.outputs import Outputs
 from hyrfpack.train.setup import check_target
 
@@ -197,7 +198,7 @@ class Request:
         """Reject an output or a work folder that may not be written, whether or not it exists."""
         outputs = self.source.output_rules(overwrite=True)
         self._check_output(outputs, overwrite=True)
-        outputs.folder(self.work, [RECORD_NAME])
+        outputs.folder(self.work, [WORK_RECORD_FILE])
         work, output = (Path(os.path.realpath(path)) for path in (self.work, self.output))
         if self.source.kind == "photos" and work.is_relative_to(os.path.realpath(self.source.path)):
             raise HyrfError(

@@ -13,9 +13,9 @@ from typing import Any
 
 from hyrfpack.atomic import write_atomic
 from hyrfpack.errors import HyrfDataError, HyrfError
+from hyrfpack.format.run_folder import WORK_RECORD_FILE
 from hyrfpack.parallel.threads import thread_count
 
-RECORD_NAME = "make.json"
 RECORD_VERSION = 1
 _READ_CHUNK_BYTES = 1 << 20
 
@@ -40,11 +40,11 @@ class WorkFolderState:
     def __init__(self, folder: Path) -> None:
         """Read the record, if any. Raises HyrfError: the folder holds something else, or the record is unreadable."""
         self.folder = folder
-        self._path = folder / RECORD_NAME
+        self._path = folder / WORK_RECORD_FILE
         self._stage_records: dict[str, dict[str, Any]] = {}
         try:
             entries = os.listdir(folder) if folder.is_dir() else []
-            if RECORD_NAME in entries:
+            if WORK_RECORD_FILE in entries:
                 self._stage_records = _parse_stage_records(self._path.read_bytes())
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
@@ -52,7 +52,7 @@ class WorkFolderState:
                 f"{self._path}: the record of finished stages cannot be read ({reason})",
                 fix="choose another folder with `work`, or delete this one to start again",
             ) from error
-        if entries and RECORD_NAME not in entries and not all(name.startswith(".") for name in entries):
+        if entries and WORK_RECORD_FILE not in entries and not all(name.startswith(".") for name in entries):
             raise HyrfError(
                 f"{folder}: this folder holds other files and is not a work folder",
                 fix="choose another folder with `work`",

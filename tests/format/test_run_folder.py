@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from commands import succeeded
 from denied_access import deny_access
 from scenes import small_model
 
@@ -67,6 +68,24 @@ def test_a_run_that_was_stopped_before_its_first_checkpoint_has_not_finished(tmp
 
     assert is_run_folder(tmp_path)
     with pytest.raises(HyrfFormatError, match="the run has not finished; finish it by running its 'hyrfpack train'"):
+        find_model(tmp_path)
+
+
+def test_the_run_of_an_interrupted_make_is_finished_by_the_same_command(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "pilots.json").write_text("{}")
+    (tmp_path / "make.json").write_text("{}")
+    with pytest.raises(HyrfFormatError, match="has not finished; finish it by repeating its 'hyrfpack make' command"):
+        find_model(tmp_path / "run")
+    assert "repeating its 'hyrfpack make' command" in succeeded("info", tmp_path / "run").stdout
+
+
+def test_the_work_folder_of_an_interrupted_make_names_its_preview(tmp_path):
+    (tmp_path / "make.json").write_text("{}")
+    with pytest.raises(HyrfFormatError, match="the work folder of 'hyrfpack make'.*repeat it, which resumes$"):
+        find_model(tmp_path)
+    (tmp_path / "preview.hyrf").write_bytes(b"")
+    with pytest.raises(HyrfFormatError, match=r"repeat it, which resumes, or name .*preview\.hyrf$"):
         find_model(tmp_path)
 
 

@@ -18,8 +18,8 @@ from hyrfpack.atomic import TEMPORARY_PREFIX
 from hyrfpack.config.make import MakeConfig
 from hyrfpack.context import RunContext
 from hyrfpack.errors import HyrfError, HyrfTrainingError
+from hyrfpack.format.run_folder import PREVIEW_FILE
 from hyrfpack.make import Stopped, make_scene, run, stages
-from hyrfpack.make.preview import PREVIEW_FILE
 from hyrfpack.make.stage_cache import interruptible
 from hyrfpack.progress import StageEvent, StepEvent
 from hyrfpack.train import TrainResult

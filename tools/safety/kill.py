@@ -43,7 +43,7 @@ import hyrfpack
 from hyrfpack.atomic import TEMPORARY_PREFIX, TEMPORARY_SUFFIX
 from hyrfpack.demo.scene import write_demo_scene
 from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
-from hyrfpack.make.state import RECORD_NAME as RECORD
+from hyrfpack.format.run_folder import WORK_RECORD_FILE as RECORD
 from hyrfpack.train.checkpoint import DIGEST_BYTES
 from tools.command import positive_integer
 
