@@ -211,6 +211,11 @@ def _is_file(entry: os.DirEntry[str]) -> bool:
         return False
 
 
+def choose_original(copies: Iterable[Path]) -> Path:
+    """Return the file of which the others are copies: the shortest name, because programs add to the name of a copy."""
+    return min(copies, key=lambda path: len(path.name))
+
+
 def first_readable_photo(photos: Iterable[StrPath]) -> PhotoFacts | None:
     """Return the facts of the first photo whose header can be read, None if no header can be read.
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import re
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import compress
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
@@ -18,11 +19,12 @@ from hyrfpack.copying import copy_file
 from hyrfpack.data import masks as mask_files
 from hyrfpack.data.archive import display_path
 from hyrfpack.data.equirectangular import CUBE_FACES, Face, FaceFile, cut_panorama, face_lens, face_size, is_panorama
-from hyrfpack.data.folder import PhotoFacts, read_photo_facts
+from hyrfpack.data.folder import PhotoFacts, choose_original, read_photo_facts
 from hyrfpack.data.masks import MaskedPhoto, MaskMatches, choose_mask_orientations
 from hyrfpack.data.pictures import open_picture, read_header, read_mask, turn_upright
 from hyrfpack.data.unusable import INVALID_NAME_REASON
 from hyrfpack.errors import HyrfDataError, strip_path
+from hyrfpack.outputs import StrPath
 from hyrfpack.parallel.threads import thread_count
 from hyrfpack.poses.job import Device
 from hyrfpack.poses.owned_files import hash_file
@@ -101,24 +103,24 @@ def read_headers(
     left_out: dict[str, str] = {}
     # Names that faces and rewritten photos must not get. Some file systems ignore letter case.
     taken_names = {path.relative_to(root).as_posix().casefold() for path in files}
-    first_by_content: dict[tuple[int, str], str] = {}
-    sizes = Counter(path.stat().st_size for path in files)
-    headers = _map_on_threads(_read_facts_or_reason, files, progress, "reading the headers of photos", len(files))
+    headers = list(_map_on_threads(_read_facts_or_reason, files, progress, "reading the headers of photos", len(files)))
+    is_usable = [
+        _shown_name(path) == str(path) and not isinstance(facts, str)
+        for path, facts in zip(files, headers, strict=True)
+    ]
+    originals = _find_copies(compress(files, is_usable))
     for path, facts in zip(files, headers, strict=True):
         source = path.relative_to(root).as_posix()
-        shown_name = os.fsencode(source).decode("utf-8", "backslashreplace")
+        shown_name = _shown_name(source)
         if shown_name != source:
             left_out[shown_name] = f"{INVALID_NAME_REASON}; rename it"
             continue
         if isinstance(facts, str):
             left_out[source] = facts
             continue
-        size = path.stat().st_size
-        if sizes[size] > 1:
-            original = first_by_content.setdefault((size, hash_file(path)), source)
-            if original != source:
-                left_out[source] = f"{COPY_REASON_PREFIX} {original}"
-                continue
+        if path in originals:
+            left_out[source] = f"{COPY_REASON_PREFIX} {originals[path].relative_to(root).as_posix()}"
+            continue
         panorama = _is_panorama_or_reason(path)
         if isinstance(panorama, str):
             left_out[source] = panorama
@@ -143,6 +145,23 @@ def read_headers(
             taken_names.add(photo.name.casefold())
         photos.append(photo)
     return sorted(photos, key=lambda photo: _natural_key(photo.name)), left_out
+
+
+def _shown_name(name: StrPath) -> str:
+    """Return a name or path as messages show it, without bytes that are not UTF-8."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
+
+
+def _find_copies(photos: Iterable[Path]) -> dict[Path, Path]:
+    """Return the original of each photo that is a copy of another, byte for byte. Photos of one size are hashed."""
+    by_size, by_content = defaultdict(list), defaultdict(list)
+    for photo in photos:
+        by_size[photo.stat().st_size].append(photo)
+    for size, group in by_size.items():
+        for photo in group if len(group) > 1 else ():
+            by_content[size, hash_file(photo)].append(photo)
+    originals = [(choose_original(group), group) for group in by_content.values()]
+    return {photo: original for original, group in originals for photo in group if photo != original}
 
 
 def _natural_key(name: str) -> tuple[list[str | int], str]:

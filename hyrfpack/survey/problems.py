@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from hyrfpack.counts import format_count
-from hyrfpack.data.folder import PhotoFacts
+from hyrfpack.data.folder import PhotoFacts, choose_original
 from hyrfpack.data.masks import find_masks, locate_masks
 from hyrfpack.data.quality import MIN_SHARPNESS
 from hyrfpack.data.unusable import format_file_names
@@ -101,9 +101,8 @@ def find_copy_problems(
         else:
             not_hashed.append(group)
     hashed = _group_files(report_each(to_hash, middle, 1.0), lambda photo: hashlib.sha256(photo.read_bytes()).digest())
-    # Programs add to the name of a copy, so the original has the shortest name.
-    groups = [sorted(group, key=lambda photo: len(photo.name)) for group in [*hashed.values(), *not_hashed]]
-    copies = [(photo, first) for first, *others in groups for photo in others]
+    originals = [(choose_original(group), group) for group in [*hashed.values(), *not_hashed]]
+    copies = [(photo, original) for original, group in originals for photo in group if photo != original]
     if not copies:
         return []
     first, of = (relative_name(item, folder) for item in copies[0])

@@ -253,6 +253,16 @@ def test_duplicates_and_unreadable_files_are_omitted_with_the_reason(tmp_path):
     assert left_out["d.png"].startswith("not a picture that can be read")
 
 
+def test_of_two_equal_photos_the_one_with_the_shorter_name_is_kept_as_in_the_survey(tmp_path):
+    for name in ("IMG_1 (1).png", "IMG_1.png", "copy of IMG_1.png"):
+        save_photo(tmp_path / name, upright_picture(1))
+    save_photo(tmp_path / "IMG_2.png", upright_picture(2))
+    photos, left_out = read_photo_headers(tmp_path)
+    assert [photo.name for photo in photos] == ["IMG_1.png", "IMG_2.png"]
+    assert set(left_out.items()) == {(name, "a copy of IMG_1.png") for name in ("IMG_1 (1).png", "copy of IMG_1.png")}
+    assert "such as IMG_1 (1).png of IMG_1.png" in " ".join(hyrfpack.describe_photos(tmp_path).problems)
+
+
 def test_photos_whose_names_are_not_utf_8_are_omitted_with_the_reason(tmp_path):
     save_photo(tmp_path / "a.jpg", upright_picture())
     invalid = tmp_path / os.fsdecode(b"caf\xe9.png")
