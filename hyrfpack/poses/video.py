@@ -128,7 +128,7 @@ def _open_container(path: Path) -> Any:
     except Exception as error:  # PyAV passes on many types of errors, of FFmpeg's demuxers and of the system
         raise HyrfDataError(
             f"{path}: this cannot be read as a video ({_error_text(error)})",
-            fix="copy it again in full, or save it as .mp4",
+            fix="copy it again in full" + ("" if path.suffix.lower() == ".mp4" else ", or save it as .mp4"),
         ) from error
 
 

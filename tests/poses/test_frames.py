@@ -305,7 +305,9 @@ def test_a_video_without_usable_frames_is_a_clear_error(wall, tmp_path):
     assert "cannot decode this kind of video" in frame_error(unknown, out)
     text = tmp_path / "text.mp4"
     text.write_text("no video")
-    assert "cannot be read as a video" in frame_error(text, out)
+    assert frame_error(text, out).endswith("; copy it again in full")
+    text = text.rename(tmp_path / "text.mov")
+    assert frame_error(text, out).endswith("; copy it again in full, or save it as .mp4")
     (tmp_path / "empty.mp4").touch()
     assert "empty" in frame_error(tmp_path / "empty.mp4", out)
     assert "no such file" in frame_error(tmp_path / "nowhere.mp4", out)
