@@ -22,12 +22,16 @@ from hyrfpack.train.exposure_pilots import (
 from hyrfpack.train.length_pilots import max_length_pilot_steps, measure_length, pilot_lengths
 from hyrfpack.train.pilot_journal import PilotJournal, PilotScore
 from hyrfpack.train.pilots import MIN_TRAINING_VIEWS, ScenePilots, pilot_step_cost
+from hyrfpack.train.resolution import PhotoSize
 from hyrfpack.train.stop import TrainingStopped
+from hyrfpack.train.teachers import count_teachers
 from hyrfpack.train.trainer import Trainer
 
 # Shorter runs have no pilots, which would take too large a part of their time.
 MIN_BUDGET_STEPS = 2_000
 MIN_EXPOSURE_STEPS = 1_000
+# Pilots have no virtual views, without which more Gaussians fit few photos more wrongly (docs/research/few-photos.md).
+MIN_BUDGET_FACTOR_WITH_VIRTUAL_VIEWS = 0.5
 MAX_BUDGET_PILOT_STEPS = 2 * MAX_BUDGET_ROUNDS * BUDGET_PILOT_STEPS
 
 
@@ -139,8 +143,12 @@ def decide(
             exposure, reasons["exposure"] = measure_exposure(pilots)
             decided = dataclasses.replace(decided, exposure=exposure)
         if measures_budget(scene, config):
-            factor, reasons["max_gaussians"] = measure_budget(pilots, bool(decided.exposure))
+            factor, reason = measure_budget(pilots, bool(decided.exposure))
+            has_virtual_views = count_teachers(len(scene.train), PhotoSize.of_views(scene.train), config) > 0
+            if has_virtual_views and factor < MIN_BUDGET_FACTOR_WITH_VIRTUAL_VIEWS:
+                factor, reason = MIN_BUDGET_FACTOR_WITH_VIRTUAL_VIEWS, f"{reason}; the least with virtual views"
             decided = dataclasses.replace(decided, budget_factor=factor)
+            reasons["max_gaussians"] = reason
         if measures_length(scene, config):
             steps, reasons["steps"] = measure_length(pilots, bool(decided.exposure), decided.budget_factor)
             decided = dataclasses.replace(decided, steps=steps)

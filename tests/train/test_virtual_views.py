@@ -14,12 +14,13 @@ from pilot_runs import interrupt_at, make_scene
 from scenes import QUIET_CONTEXT, ball_points, ball_scene, ring, small_model
 
 from hyrfpack.context import RunContext
+from hyrfpack.data import PictureCache
 from hyrfpack.errors import HyrfError
 from hyrfpack.format.run_folder import TEACHER_FILES
 from hyrfpack.model import HybridModel
 from hyrfpack.progress import Event, TaskEvent
 from hyrfpack.render import RenderSettings, render_view
-from hyrfpack.train import TrainConfig, Trainer, results, teachers, train_model
+from hyrfpack.train import TrainConfig, Trainer, decisions, results, teachers, train_model
 from hyrfpack.train.exposure_map import fit_exposure_map
 from hyrfpack.train.resolution import PhotoSize
 from hyrfpack.train.run import is_begun
@@ -127,6 +128,18 @@ def test_only_runs_of_usual_length_on_few_photos_have_teachers(photos, size, ste
     config = TrainConfig(steps=steps)
     assert count_teachers(photos, size, config) == expected
     assert count_teachers(photos, size, dataclasses.replace(config, virtual_views=False)) == 0
+
+
+@pytest.mark.parametrize(
+    ("measured", "virtual_views", "chosen"), [(0.25, True, 0.5), (0.25, False, 0.25), (0.7, True, 0.7)]
+)
+def test_runs_with_virtual_views_have_at_least_half_of_the_usual_budget(measured, virtual_views, chosen, monkeypatch):
+    monkeypatch.setattr(decisions, "measure_budget", lambda *_: (measured, "the larger pilot scored as much"))
+    config = TrainConfig(steps=3_000, exposure=False, early_stop=False, virtual_views=virtual_views)
+    scene = ball_scene(views=8, points=60, side=24)
+    made = decisions.decide(scene, config, PictureCache(2**20), torch.device("cpu"))
+    assert made.config.budget_factor == chosen
+    assert ("the least with virtual views" in made.reasons["max_gaussians"]) == (chosen != measured)
 
 
 def test_steps_take_photos_and_virtual_views_in_turn_and_the_last_ones_photos():
