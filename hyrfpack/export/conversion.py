@@ -141,7 +141,7 @@ def _convert(
     progress(TaskEvent("reading the file back", 0.5))
     decoded = kind.decode(data, str(target))
     psnr = _measure_psnr(cropped, decoded, weighted, part_of_progress(progress, 0.6, 0.9))
-    if fmean(psnr) < MIN_ROUNDED_PSNR_DB and not kind.stores_floats:
+    if fmean(psnr) < MIN_ROUNDED_PSNR_DB and not kind.stores_origin:
         # `_check_limits` has already warned if the format cannot store `antialiased`.
         comparable = replace(decoded, antialiased=selected.antialiased)
         rounding = _measure_psnr(selected, comparable, weighted, part_of_progress(progress, 0.9, 1.0))
@@ -243,7 +243,7 @@ def _warn_of_clamped_scales(kind: SplatFormat, is_clamped: np.ndarray, than: str
 def _warn_of_rounding(kind: SplatFormat, psnr: float) -> None:
     """Log a warning if the rounding of a format, without what was left out on purpose, leaves a low PSNR in dB."""
     if psnr < MIN_ROUNDED_PSNR_DB:
-        alternatives = ", ".join(row.ending for row in FORMATS.values() if row.stores_floats)
+        alternatives = ", ".join(row.ending for row in FORMATS.values() if row.stores_origin)
         _LOG.warning(
             f"{kind.ending} leaves {psnr:.1f} dB, because its numbers are too coarse for this scene; choose another "
             f"format ({alternatives})"

@@ -45,24 +45,25 @@ class SplatFormat(FileKind):
         decode: turns the bytes of a file, and its name in error messages, into splats in the axes of the splats that
             `encode` took. Raises HyrfDataError if the bytes are damaged or of another format.
         is_readable: whether `read_splats` accepts the format. The others are decoded only to measure what was written.
-        stores_floats: whether all numbers are stored with 32 bits, so that the range of a scene costs no precision.
+        stores_origin: whether numbers are float32, and positions relative to an origin that the file stores, so that
+            neither the range of a scene nor its distance from the world's origin costs precision.
     """
 
     encode: Callable[[Splats, Hints], bytes]
     decode: Callable[[bytes, str], Splats]
     is_readable: bool = False
-    stores_floats: bool = False
+    stores_origin: bool = False
 
 
 def _make_usd_format(extension: usd.Extension) -> SplatFormat:
     encode, decode = partial(usd.encode, extension=extension), partial(usd.decode, extension=extension)
     return SplatFormat(
-        ending=f".{extension}", encode=encode, decode=decode, module=usd.REQUIRED_MODULE, stores_floats=True
+        ending=f".{extension}", encode=encode, decode=decode, module=usd.REQUIRED_MODULE, stores_origin=True
     )
 
 
 _FORMAT_ROWS = (
-    SplatFormat(ending=".ply", encode=ply.encode, decode=ply.decode, is_readable=True, stores_floats=True),
+    SplatFormat(ending=".ply", encode=ply.encode, decode=ply.decode, is_readable=True),
     SplatFormat(
         ending=".splat",
         encode=splat.encode,
@@ -80,7 +81,7 @@ _FORMAT_ROWS = (
         max_scale=spz.MAX_SCALE,
         stores_antialiased=True,
     ),
-    SplatFormat(ending=".glb", encode=gltf.encode, decode=gltf.decode, stores_floats=True),
+    SplatFormat(ending=".glb", encode=gltf.encode, decode=gltf.decode, stores_origin=True),
     *map(_make_usd_format, usd.EXTENSIONS),
     SplatFormat(ending=".sog", encode=sog.encode, decode=sog.decode, is_readable=True, stores_antialiased=True),
 )

@@ -83,7 +83,31 @@ def test_a_low_psnr_by_rounding_is_a_warning_that_names_other_formats(ending, ch
     report = hyrfpack.convert_splats(source, tmp_path / f"after{ending}")
     assert report.psnr < 30
     assert f"{ending} leaves {report.psnr:.1f} dB, because its numbers are too coarse" in caplog.text
-    assert "choose another format (.ply, .glb, .usda, .usdc, .usdz)" in caplog.text
+    assert "choose another format (.glb, .usda, .usdc, .usdz)" in caplog.text
+    caplog.clear()
+    assert hyrfpack.convert_splats(source, tmp_path / "after.glb").psnr > 60
+    assert not caplog.text
+
+
+def write_text_ply(path: Path, splats: Splats) -> Path:
+    """Write splats as a text PLY, whose positions may have all digits of float64."""
+    header, _, body = FORMATS[".ply"].encode(splats, NO_HINTS).partition(b"end_header\n")
+    others = np.frombuffer(body, "<f4").reshape(len(splats), -1)[:, 3:]
+    rows = np.column_stack((splats.positions, others.astype(np.float64)))
+    lines = header.decode().replace("binary_little_endian", "ascii").replace("property float", "property double")
+    path.write_text(lines + "end_header\n" + "\n".join(" ".join(map(repr, row)) for row in rows.tolist()) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("ending", [".ply", ".splat"])
+def test_a_format_without_an_origin_of_its_own_is_reported_for_map_coordinates(ending, tmp_path, caplog):
+    splats = ball_splats(GAUSSIAN_COUNT, degree=0)
+    splats.positions[:], splats.scales[:] = 0.2 * splats.positions + (5e5, 4e6, 100), np.float32(0.2) * splats.scales
+    source = write_text_ply(tmp_path / "survey.ply", splats)
+    report = hyrfpack.convert_splats(source, tmp_path / f"after{ending}")
+    assert report.psnr < 30
+    assert f"{ending} leaves {report.psnr:.1f} dB, because its numbers are too coarse" in caplog.text
+    assert "choose another format (.glb, .usda, .usdc, .usdz)" in caplog.text
     caplog.clear()
     assert hyrfpack.convert_splats(source, tmp_path / "after.glb").psnr > 60
     assert not caplog.text
