@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -18,6 +20,8 @@ from hyrfpack.format.info import SectionSize
 from hyrfpack.outputs import ARCHIVE_SUFFIXES, PICTURE_SUFFIXES, VIDEO_SUFFIXES
 
 EXPORT_ONLY_SUFFIXES = (".glb", ".html", ".obj", ".stl", ".usda", ".usdc", ".usdz")
+# Longest sides of boxes, world units, whose numbers are printed with decimals.
+MIN_DECIMAL_SIZE, MAX_DECIMAL_SIZE = 1e-6, 1e12
 
 
 @click.command(short_help="Describe a file, a run or a folder of photos.")
@@ -157,7 +161,8 @@ def _print_splats(path: Path, as_json: bool) -> None:
         ("harmonics", f"degree {facts.degree}"),
     ]
     if facts.low is not None and facts.high is not None and facts.opacity is not None:
-        low, high = (", ".join(f"{value:.4g}" for value in corner) for corner in (facts.low, facts.high))
+        size = max(end - start for start, end in zip(facts.low, facts.high, strict=True))
+        low, high = (", ".join(_format_lengths(corner, size)) for corner in (facts.low, facts.high))
         rows += [("centres", f"from ({low}) to ({high}), world units"), ("opacity", f"median {facts.opacity:.2f}")]
     for name, text in rows:
         print_line(f"  {name:<14}  {text}")
@@ -191,9 +196,9 @@ def _print_model_facts(file: Path, facts: dict) -> None:
     click.echo("\n" + format_section_table(sections, facts["bytes"], facts["gaussians"]))
     click.echo("\nmodel")
     frame = config["frame"]
-    center = ", ".join(f"{value:.4g}" for value in frame["center"])
-    half = " x ".join(f"{2.0 * value * frame['scale']:.4g}" for value in frame["half_extent"])
-    print_line(f"  {'box':<18}  {half} around ({center}), world units")
+    sides = [2.0 * value * frame["scale"] for value in frame["half_extent"]]
+    box, center = (_format_lengths(values, max(sides)) for values in (sides, frame["center"]))
+    print_line(f"  {'box':<18}  {' x '.join(box)} around ({', '.join(center)}), world units")
     if rotation := frame.get("rotation"):
         print_line(f"  {'rotation':<18}  {', '.join(f'{value:.6g}' for value in rotation)} (wxyz)")
     for name in ("geometry", "radiance"):
@@ -214,3 +219,17 @@ def _print_model_facts(file: Path, facts: dict) -> None:
 
 def _format_settings(values: dict) -> str:
     return ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in values.items())
+
+
+def _format_lengths(values: Sequence[float], size: float) -> list[str]:
+    """Format coordinates or lengths to a thousandth of the size of their box or finer, however far away it is.
+
+    Args:
+        values: numbers in world units.
+        size: longest side of the box, world units. Numbers of much smaller and larger boxes, and of points, have
+            nine digits instead.
+    """
+    if not MIN_DECIMAL_SIZE <= size <= MAX_DECIMAL_SIZE:
+        return [f"{value:.9g}" for value in values]
+    decimals = max(0, math.ceil(3 - math.log10(size)))
+    return [f"{round(value, decimals) + 0.0:.{decimals}f}" for value in values]  # + 0.0 turns -0.0 into 0.0

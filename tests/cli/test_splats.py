@@ -19,6 +19,7 @@ from hyrfpack.cameras.capture import scene_provenance
 from hyrfpack.cameras.files import cameras_to_json
 from hyrfpack.data import load_scene
 from hyrfpack.format import save_model
+from hyrfpack.model import Frame
 from hyrfpack.splats.files import READABLE_ENDINGS
 from hyrfpack.splats.formats import sog
 from hyrfpack.splats.formats.hints import NO_HINTS
@@ -80,6 +81,33 @@ def test_info_prints_format_count_degree_bounds_and_bytes(kind, files):
     printed = succeeded("info", path).stdout
     assert printed.splitlines()[0] == f"{path}: {size:,} bytes, 60 Gaussians"
     assert f"degree {facts['degree']}" in printed and "centres" in printed
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        pytest.param((500123.4, 4e6, 98.7), (500321.9, 4000150, 131.3), "500123.4", id="map"),
+        pytest.param(
+            (-0.0001, -1, 0), (2.5, 1.5, 3.25), "from (0.000, -1.000, 0.000) to (2.500, 1.500, 3.250)", id="room"
+        ),
+        pytest.param((-409.7, 0, 0), (1000, 2e5, 1e6), "from (-410, 0, 0) to (1000, 200000, 1000000)", id="sky"),
+        pytest.param((0, 0, 0), (0.01, 0, 0.02), "to (0.01000, 0.00000, 0.02000)", id="insect"),
+        pytest.param((500123.5, 0, 0), (500123.5, 0, 0), "from (500123.5, 0, 0) to (500123.5, 0, 0)", id="one place"),
+    ],
+)
+def test_info_prints_positions_to_a_thousandth_of_the_box(low, high, expected, tmp_path):
+    splats = replace(BALL_SPLATS[:2], positions=np.array([low, high], np.float64))
+    path = tmp_path / "box.ply"
+    path.write_bytes(FORMATS[".ply"].encode(splats, NO_HINTS))
+    (line,) = (line for line in succeeded("info", path).stdout.splitlines() if "centres" in line)
+    assert expected in line and "e+" not in line
+
+
+def test_info_prints_the_box_of_a_model_in_map_coordinates_with_decimals(tmp_path):
+    frame = Frame((500123.44, 4000000.56, 98.7), 50.0, (1.0, 1.0, 0.5))
+    save_model(small_model(np.zeros((1, 3)), frame=frame, fields=0.0), tmp_path / "survey.hyrf")
+    box = "100.0 x 100.0 x 50.0 around (500123.4, 4000000.6, 98.7), world units"
+    assert box in succeeded("info", tmp_path / "survey.hyrf").stdout
 
 
 @pytest.mark.parametrize("kind", FILE_KINDS)
