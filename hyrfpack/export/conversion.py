@@ -24,7 +24,7 @@ from hyrfpack.export.kinds import (
     find_kind_by_ending,
     select_splats,
 )
-from hyrfpack.export.measure import measure_splats_psnr
+from hyrfpack.export.measure import MIN_ROUNDED_PSNR_DB, measure_splats_psnr
 from hyrfpack.outputs import Outputs
 from hyrfpack.progress import Progress, TaskEvent, part_of_progress
 from hyrfpack.splats.draw import Drawable
@@ -32,7 +32,7 @@ from hyrfpack.splats.files import READABLE_ENDINGS, bytes_on_disk, read_splats
 from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.names import find_sog_folder, is_splats
 from hyrfpack.splats.splats import Splats
-from hyrfpack.splats.table import FORMATS, SplatFormat
+from hyrfpack.splats.table import ENDINGS_WITH_ORIGIN, FORMATS, SplatFormat
 from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
 
 _LOG = logging.getLogger(__name__)
@@ -41,8 +41,6 @@ MEASURED_VIEWS = 12
 MEASURED_SIZE_PIXELS = 400
 # Smaller Gaussians are points in pictures of the whole scene, so that it does not show if their scales are clamped.
 MIN_VISIBLE_SCALE_RADII = 1e-3
-# Rounding that leaves a lower PSNR is reported: such pictures visibly differ.
-MIN_ROUNDED_PSNR_DB = 30.0
 
 
 @dataclass(frozen=True)
@@ -243,10 +241,9 @@ def _warn_of_clamped_scales(kind: SplatFormat, is_clamped: np.ndarray, than: str
 def _warn_of_rounding(kind: SplatFormat, psnr: float) -> None:
     """Log a warning if the rounding of a format, without what was left out on purpose, leaves a low PSNR in dB."""
     if psnr < MIN_ROUNDED_PSNR_DB:
-        alternatives = ", ".join(row.ending for row in FORMATS.values() if row.stores_origin)
         _LOG.warning(
             f"{kind.ending} leaves {psnr:.1f} dB, because its numbers are too coarse for this scene; choose another "
-            f"format ({alternatives})"
+            f"format ({', '.join(ENDINGS_WITH_ORIGIN)})"
         )
 
 

@@ -23,6 +23,9 @@ from hyrfpack.scene import Camera, View
 from hyrfpack.splats.draw import Drawable, draw
 from hyrfpack.splats.splats import Splats
 
+# Rounding that leaves a lower PSNR is reported: such pictures visibly differ.
+MIN_ROUNDED_PSNR_DB = 30.0
+
 
 @dataclass(frozen=True)
 class PsnrScores:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import logging
-import math
 from dataclasses import replace
 
 from hyrfpack.choices import CONSISTENT_EXPOSURE, SPLAT_EXPOSURES
 from hyrfpack.counts import format_count
 from hyrfpack.export.baked_scene import BakedScene, SplatsWithBackground
-from hyrfpack.export.measure import PsnrScores, measure_psnr
+from hyrfpack.export.measure import MIN_ROUNDED_PSNR_DB, PsnrScores, measure_psnr
 from hyrfpack.export.report import ExportReport
 from hyrfpack.export.source import Source
-from hyrfpack.measure.psnr import mse_from_psnr
 from hyrfpack.progress import Progress, part_of_progress
-from hyrfpack.splats.table import FORMATS, FileKind
+from hyrfpack.splats.table import ENDINGS_WITH_ORIGIN, FORMATS, FileKind
 
 _LOG = logging.getLogger(__name__)
 
@@ -60,9 +58,8 @@ def _add_file_scores(
         _LOG.warning("quality is not measured, because the masks leave no pixel of the held-out photos")
         return result
     file_scores, baked_scores = scores["file"], scores["baked"]
-    cost = _estimate_cost_db(baked_scores, file_scores, loaded.photo_mse)
-    if cost > MIN_REPORTED_COST_DB:
-        _warn_of_cost(cost, loaded, kind)
+    if loss := _describe_loss(baked_scores, file_scores):
+        _warn_of_loss(loss, loaded, kind)
     return replace(
         result,
         views=file_scores.views,
@@ -74,8 +71,8 @@ def _add_file_scores(
     )
 
 
-def _warn_of_cost(cost: float, loaded: Source, kind: FileKind) -> None:
-    """Log a warning that a format loses `cost` dB, and what to do about it."""
+def _warn_of_loss(loss: str, loaded: Source, kind: FileKind) -> None:
+    """Log a warning that a format causes a loss, as `_describe_loss` says it, and what to do about it."""
     if loaded.model.config.antialiased and not kind.stores_antialiased:
         alternatives = " or ".join(row.ending for row in FORMATS.values() if row.stores_antialiased)
         _LOG.warning(
@@ -85,8 +82,8 @@ def _warn_of_cost(cost: float, loaded: Source, kind: FileKind) -> None:
         return
     where = "" if loaded.cameras else " at generated viewpoints"
     _LOG.warning(
-        f"{kind.ending} costs {cost:.1f} dB{where}, because its numbers are too coarse for this scene; choose another "
-        "format, or scale the scene"
+        f"{kind.ending} {loss}{where}, because its numbers are too coarse for this scene; choose another format "
+        f"({', '.join(ENDINGS_WITH_ORIGIN)}), move the scene to the origin, or scale the scene"
     )
 
 
@@ -108,17 +105,15 @@ def _add_exposure_scores(result: ExportReport, loaded: Source, baked: BakedScene
     )
 
 
-def _estimate_cost_db(baked_scores: PsnrScores, file_scores: PsnrScores, model_mse: float) -> float:
-    """Return the loss of PSNR in dB against photos that a format causes, measured or, without photos, estimated.
-
-    The estimate assumes that the errors of the format are independent of those of the model, so that squared errors
-    add up. Rounding errors far below the model's own error then cost almost nothing.
+def _describe_loss(baked_scores: PsnrScores, file_scores: PsnrScores) -> str | None:
+    """Say what a format loses, against photos or else against the model; None if that hardly shows.
 
     Args:
         baked_scores, file_scores: scores of the baked splats and of the file as read back.
-        model_mse: mean squared error of the model's pictures against its photos.
     """
     if baked_scores.photos is not None and file_scores.photos is not None:
-        return baked_scores.photos - file_scores.photos
-    file_mse, baked_mse = (mse_from_psnr(scores.model) for scores in (file_scores, baked_scores))
-    return 10 * math.log10((model_mse + file_mse) / (model_mse + baked_mse))
+        cost = baked_scores.photos - file_scores.photos
+        return f"costs {cost:.1f} dB" if cost > MIN_REPORTED_COST_DB else None
+    # A low PSNR that the baked splats have already is not the format's fault.
+    is_low = file_scores.model < min(MIN_ROUNDED_PSNR_DB, baked_scores.model - MIN_REPORTED_COST_DB)
+    return f"leaves {file_scores.model:.1f} dB" if is_low else None

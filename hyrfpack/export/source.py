@@ -13,7 +13,6 @@ from hyrfpack.cameras.capture import MISMATCH_REMEDY, Capture
 from hyrfpack.cameras.paths import Viewpoint, downward_direction, look_at, orbit
 from hyrfpack.cameras.view_sampling import interpolate_views
 from hyrfpack.errors import HyrfDataError, HyrfError
-from hyrfpack.evaluate.metrics import provenance_mse
 from hyrfpack.format import describe_file
 from hyrfpack.format.parts import load_model_or_parts
 from hyrfpack.model import HybridModel
@@ -47,7 +46,6 @@ class Source:
             the file keeps fewer than MIN_CAMERAS_TO_HOLD_OUT cameras, or MIN_COARSE_CAMERAS_TO_HOLD_OUT coarse ones.
         up: (3,) unit vector that points up in the scene.
         center: (3,) point at the centre of interest, world units.
-        photo_mse: mean squared error of the model's pictures against its photos, as stated in the file.
         has_coarse_cameras: whether `cameras` are approximate, as in small files, and so unsuitable for training.
         fits_measured_views: whether `measured_views` are among `fit_cameras`, because there are too few cameras.
     """
@@ -59,7 +57,6 @@ class Source:
     measured_views: list[tuple[Camera, View | None]]
     up: np.ndarray
     center: np.ndarray
-    photo_mse: float
     has_coarse_cameras: bool = False
     fits_measured_views: bool = False
 
@@ -101,7 +98,6 @@ class Source:
             measured_views=chosen.measured,
             up=up if capture.is_synthetic else _choose_up(capture.cameras, up),
             center=center,
-            photo_mse=provenance_mse(facts["provenance"]),
             has_coarse_cameras=capture.is_coarse,
             fits_measured_views=chosen.fits_measured,
         )

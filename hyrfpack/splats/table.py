@@ -86,3 +86,4 @@ _FORMAT_ROWS = (
     SplatFormat(ending=".sog", encode=sog.encode, decode=sog.decode, is_readable=True, stores_antialiased=True),
 )
 FORMATS = {row.ending: row for row in _FORMAT_ROWS}
+ENDINGS_WITH_ORIGIN = tuple(row.ending for row in _FORMAT_ROWS if row.stores_origin)

@@ -360,7 +360,8 @@ def test_a_format_too_coarse_for_the_unit_of_length_is_reported(unit, view_sourc
     export_in_unit(unit, view_source, tmp_path)
     message = caplog.messages[-1]
     assert caplog.records[-1].levelname == "WARNING"
-    pattern = r"\.spz costs \d+\.\d dB[^\n]*, because its numbers are too coarse[^\n]*, or scale the scene"
+    verb = "costs" if view_source == "photos" else "leaves"
+    pattern = rf"\.spz {verb} \d+\.\d dB[^\n]*, because its numbers are too coarse[^\n]*\(\.glb, .*, or scale the scene"
     assert re.fullmatch(pattern, message)
     assert ("at generated viewpoints" in message) == (view_source == "generated viewpoints")
 
@@ -372,12 +373,29 @@ def test_invisible_rounding_is_not_reported(view_source, tmp_path, caplog):
     assert caplog.messages[-1] == f"measuring at {report.views} views"
 
 
-def test_the_cost_of_a_format_is_measured_on_photos_if_there_are_any():
-    """Neither the model's own PSNR nor the similarity of the file's pictures to the model's decides."""
+def test_the_loss_of_a_format_is_measured_on_photos_if_there_are_any():
+    """The similarity of the file's pictures to the model's does not decide there."""
     baked_scores = PsnrScores(60, 30.0, 1)
-    assert scores._estimate_cost_db(baked_scores, PsnrScores(20, 29.7, 1), 1e-9) == pytest.approx(0.3)
-    cost = scores._estimate_cost_db(baked_scores, PsnrScores(20, None, 1), 1e-9)
-    assert cost == pytest.approx(10 * np.log10((1e-9 + 1e-2) / (1e-9 + 1e-6)))
+    assert scores._describe_loss(baked_scores, PsnrScores(20, 29.7, 1)) is None
+    assert scores._describe_loss(baked_scores, PsnrScores(40, 28.0, 1)) == "costs 2.0 dB"
+
+
+@pytest.mark.parametrize(
+    ("baked", "file", "loss"),
+    [(60, 45, None), (60, 30.1, None), (60, 29.9, "leaves 29.9 dB"), (25, 24.5, None), (25, 20, "leaves 20.0 dB")],
+)
+def test_without_photos_a_format_is_reported_only_if_it_leaves_a_low_psnr(baked, file, loss):
+    assert scores._describe_loss(PsnrScores(baked, None, 1), PsnrScores(file, None, 1)) == loss
+
+
+def test_an_export_of_an_accurate_import_is_not_reported_as_coarse(tmp_path, caplog):
+    """The PSNR of an import is that against the splats, and says nothing about photos."""
+    model = small_model(GAUSSIAN_POSITIONS, fields=0.0, color_logits=1.0, scale_logits=-1.5)
+    path = tmp_path / "imported.hyrf"
+    save_model(model, path, provenance={"psnr": 55.0, "choices": {"imported": "from a.ply"}})
+    report = export(path, tmp_path / "a.spz", degree=0)
+    assert report.psnr_baked - report.psnr > 3 and report.psnr > 30
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
 
 
 def test_held_out_photos_are_scored_but_not_fitted(plain_file, tmp_path, monkeypatch):
