@@ -35,7 +35,7 @@ OPTIONAL_PACKAGES = {
     "av": ("av", "videos"),
     "pillow_heif": ("pillow-heif", "HEIC photos"),
     "zstandard": ("zstandard", ".spz"),
-    "trimesh": ("trimesh", "writing .points.glb and .mesh.glb, collision meshes, fewer triangles"),
+    "trimesh": ("trimesh", "collision meshes, meshes with fewer triangles"),
     "skimage": ("scikit-image", "meshes"),
     "fast_simplification": ("fast-simplification", "meshes"),
     "pxr": ("usd-core", "USD"),

@@ -29,7 +29,7 @@ HTML_PAGE = FileKind(ending=".html", stores_antialiased=True)
 TRANSFORMS_JSON = FileKind(ending=".json", max_degree=0)
 POINT_FILES = (
     FileKind(ending=".points.ply", max_degree=0),
-    FileKind(ending=".points.glb", max_degree=0, module="trimesh"),
+    FileKind(ending=".points.glb", max_degree=0),
 )
 MESH_FILES = tuple(
     FileKind(ending=ending, max_degree=0, module="skimage") for ending in (".mesh.glb", ".mesh.ply", ".obj", ".stl")
@@ -126,9 +126,6 @@ def check_request(kind: FileKind, target: str | os.PathLike[str], config: Export
     _check_mesh_settings(kind, target, config)
     _check_page_settings(kind, target, config)
     check_package(kind, target)
-    if kind.ending == ".mesh.glb":
-        with needs_package(f"{target}: writing this file"):
-            import_module("trimesh")
     if config.faces is not None or kind in COLLISION_FILES:
         with needs_package(f"{target}: reducing the triangles of a mesh"):
             import_module("fast_simplification")

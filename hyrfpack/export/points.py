@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from hyrfpack.errors import HyrfDataError, needs_package
+from hyrfpack.errors import HyrfDataError
 from hyrfpack.scene import Camera
-from hyrfpack.splats.formats.gltf import GLTF_UP, encode_linear_colors
+from hyrfpack.splats.glb import GLTF_UP, LINES_MODE, POINTS_MODE, Shape, encode_shapes, linear_from_srgb
 from hyrfpack.splats.placement import choose_local_origin, subtract_origin, upright_rotation
 from hyrfpack.splats.splats import Splats
 
@@ -36,7 +36,6 @@ def encode_points(splats: Splats, cameras: Sequence[Camera], extension: Literal[
         up: (3,) unit vector in world axes that points up in the scene.
 
     Raises:
-        HyrfError: trimesh is missing.
         HyrfDataError: there is nothing to show, or positions are beyond float32.
     """
     if not len(splats) and not cameras:
@@ -47,26 +46,17 @@ def encode_points(splats: Splats, cameras: Sequence[Camera], extension: Literal[
 
 
 def _encode_glb(splats: Splats, frusta: np.ndarray, origin: np.ndarray, up: np.ndarray) -> bytes:
-    with needs_package("writing points as .glb"):
-        import trimesh
-        from trimesh.path.entities import Line
-
-    scene, node_transform = trimesh.Scene(), np.eye(4)
-    node_transform[:3, :3] = upright_rotation(up, np.array(GLTF_UP))
-    node_transform[:3, 3] = node_transform[:3, :3] @ origin
+    shapes = []
     if len(splats):
-        cloud = trimesh.PointCloud(subtract_origin(splats, origin), colors=encode_linear_colors(splats))
-        scene.add_geometry(cloud, node_name="gaussians", geom_name="gaussians", transform=node_transform)
+        colors = np.column_stack((linear_from_srgb(splats.base_colors), splats.opacities)).astype(np.float32)
+        points = {"POSITION": subtract_origin(splats, origin), "COLOR_0": colors}
+        shapes.append(Shape("gaussians", POINTS_MODE, points))
     if len(frusta):
-        strokes = np.arange(len(frusta))[:, None] * frusta.shape[1] + _FRUSTUM_STROKE
-        lines = trimesh.path.Path3D(
-            entities=[Line(stroke) for stroke in strokes],
-            vertices=(frusta - origin).reshape(-1, 3),
-            colors=np.tile(np.array(_CAMERA_COLOR, np.uint8), (len(frusta), 1)),
-            process=False,
-        )
-        scene.add_geometry(lines, node_name="cameras", geom_name="cameras", transform=node_transform)
-    return scene.export(file_type="glb")
+        ends = np.stack((_FRUSTUM_STROKE[:-1], _FRUSTUM_STROKE[1:]), axis=1).ravel()
+        positions = (frusta[:, ends] - origin).reshape(-1, 3).astype(np.float32)
+        colors = np.tile(np.array(_CAMERA_COLOR, np.uint8), (len(positions), 1))
+        shapes.append(Shape("cameras", LINES_MODE, {"POSITION": positions, "COLOR_0": colors}))
+    return encode_shapes(shapes, upright_rotation(up, np.array(GLTF_UP)), origin)
 
 
 def _encode_ply(splats: Splats, frusta: np.ndarray, origin: np.ndarray) -> bytes:

@@ -7,22 +7,22 @@ import math
 
 import numpy as np
 
-from hyrfpack.errors import HyrfDataError, needs_package
+from hyrfpack.errors import HyrfDataError
 from hyrfpack.mesh.extract import Mesh
-from hyrfpack.splats.formats.gltf import GLTF_UP, linear_from_srgb
+from hyrfpack.splats.glb import GLTF_UP, TRIANGLES_MODE, Shape, encode_shapes, linear_from_srgb
 from hyrfpack.splats.placement import choose_local_origin, upright_rotation
 
 _LOG = logging.getLogger(__name__)
 
 MAX_STEP_RATIO = 1e-5  # Coarser steps of a .stl, as a ratio of the mesh's size, are reported.
-_UNLIT_EXTENSION = "KHR_materials_unlit"  # colours of photos have the light in them already
 
 
 def encode_mesh(mesh: Mesh, extension: str, up: np.ndarray) -> bytes:
     """Encode a mesh in the input's axes and units. The same mesh gives the same bytes.
 
-    - A .glb has linear vertex colours, normals, and a material without light. Its node turns the mesh upright, and
-      translates it if it lies far from the origin compared to its size. Without colours, it has positions alone.
+    - A .glb has linear float32 vertex colours, unit normals, and a material without light. Its node turns the mesh
+      upright, and translates it if it lies far from the origin compared to its size. Without colours, it has positions
+      alone.
     - A .ply has sRGB vertex colours, and float64 positions where float32 would be too coarse.
     - A .obj has sRGB vertex colours, if there are any, after the positions, which most programs read. Positions
       have as many digits as the mesh's size needs.
@@ -35,7 +35,6 @@ def encode_mesh(mesh: Mesh, extension: str, up: np.ndarray) -> bytes:
 
     Raises:
         HyrfDataError: positions are beyond float32.
-        HyrfError: trimesh is missing.
     """
     origin = choose_local_origin(mesh.vertices)
     with np.errstate(over="ignore"):
@@ -58,28 +57,31 @@ def encode_mesh(mesh: Mesh, extension: str, up: np.ndarray) -> bytes:
 
 
 def _encode_glb(mesh: Mesh, local: np.ndarray, origin: np.ndarray, up: np.ndarray) -> bytes:
-    with needs_package("writing a mesh as .glb"):
-        import trimesh
+    attributes = {"POSITION": local}
+    if mesh.colors is not None:
+        attributes["COLOR_0"] = linear_from_srgb(mesh.colors / 255).astype(np.float32)
+        attributes["NORMAL"] = _compute_vertex_normals(mesh, up)
+    shape = Shape("mesh", TRIANGLES_MODE, attributes, mesh.faces)
+    return encode_shapes([shape], upright_rotation(up, np.array(GLTF_UP)), origin)
 
-    node_transform = np.eye(4)
-    node_transform[:3, :3] = upright_rotation(up, np.array(GLTF_UP))
-    node_transform[:3, 3] = node_transform[:3, :3] @ origin
-    scene = trimesh.Scene()
-    if mesh.colors is None:
-        shape = trimesh.Trimesh(local, mesh.faces, process=False)
-        scene.add_geometry(shape, node_name="mesh", geom_name="mesh", transform=node_transform)
-        return scene.export(file_type="glb", include_normals=False)
-    colors = np.round(255 * linear_from_srgb(mesh.colors / 255)).astype(np.uint8)
-    shape = trimesh.Trimesh(local, mesh.faces, vertex_colors=colors, process=False)
-    scene.add_geometry(shape, node_name="mesh", geom_name="mesh", transform=node_transform)
 
-    def make_unlit(tree: dict) -> None:
-        pbr = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-        tree["materials"] = [{"pbrMetallicRoughness": pbr, "doubleSided": True, "extensions": {_UNLIT_EXTENSION: {}}}]
-        tree["extensionsUsed"] = [_UNLIT_EXTENSION]
-        tree["meshes"][0]["primitives"][0]["material"] = 0
+def _compute_vertex_normals(mesh: Mesh, up: np.ndarray) -> np.ndarray:
+    """Return unit normals (V, 3) float32: means over the triangles of each vertex, weighted by area.
 
-    return scene.export(file_type="glb", include_normals=True, tree_postprocessor=make_unlit)
+    Where they cancel out, as between triangles of opposite winding, the normal is `up`.
+    """
+    crosses = _compute_face_crosses(mesh)
+    sums = np.column_stack(
+        [np.bincount(mesh.faces.ravel(), np.repeat(axis, 3), len(mesh.vertices)) for axis in crosses.T]
+    )
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    return np.where(lengths > 0, sums / np.where(lengths > 0, lengths, 1), up).astype(np.float32)
+
+
+def _compute_face_crosses(mesh: Mesh) -> np.ndarray:
+    """Return the normals (F, 3) of the triangles, as long as twice their areas."""
+    corners = mesh.vertices[mesh.faces]
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def _encode_ply(mesh: Mesh, positions: np.ndarray) -> bytes:
@@ -110,8 +112,7 @@ def _encode_obj(mesh: Mesh) -> bytes:
 
 
 def _encode_stl(mesh: Mesh) -> bytes:
-    corners = mesh.vertices[mesh.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    corners, normals = mesh.vertices[mesh.faces], _compute_face_crosses(mesh)
     triangles = np.zeros(len(corners), [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     triangles["normal"] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     triangles["corners"] = corners

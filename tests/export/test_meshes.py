@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 from commands import succeeded
+from glb_arrays import read_attribute, srgb_from_linear
 from scenes import QUIET_CONTEXT, ring, small_model
 
 import hyrfpack
@@ -55,8 +56,44 @@ def test_a_glb_is_upright_with_linear_colours_and_no_light():
     assert read.vertices[:, 1].max() == pytest.approx(2)  # the corner at y = -2, which is up
     (stored,) = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False).geometry.values()
     colors = stored.visual.vertex_attributes["color"]
-    np.testing.assert_array_equal(colors[:, :3], [[255, 0, 0], [0, 255, 0], [0, 0, 255], [128] * 3])  # 188 is half
+    np.testing.assert_allclose(colors, [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.503] * 3], atol=5e-4)  # 188 is half
     assert b"KHR_materials_unlit" in data
+
+
+def test_a_glb_tells_all_dark_colours_apart():
+    levels = np.arange(256, dtype=np.uint8)
+    vertices, faces = np.random.default_rng(0).normal(size=(256, 3)), np.arange(255).reshape(-1, 3)
+    grey = replace(TETRAHEDRON_MESH, vertices=vertices, faces=faces, colors=np.repeat(levels[:, None], 3, axis=1))
+    colors = read_attribute(encode_mesh(grey, "glb", UP), "COLOR_0")
+    np.testing.assert_array_equal(np.round(255 * srgb_from_linear(colors[:, 0])), levels)
+
+
+def one_triangle(*faces: list[int]) -> Mesh:
+    """Return triangles between the vertices (0, 0, 0), (1, 0, 0) and (0, -2, 0)."""
+    colors = TETRAHEDRON_MESH.colors
+    assert colors is not None
+    vertices = TETRAHEDRON_MESH.vertices[:3]
+    return replace(TETRAHEDRON_MESH, vertices=vertices, faces=np.array(faces), colors=colors[:3])
+
+
+def test_a_glb_has_unit_normals_that_point_outward():
+    normals = read_attribute(encode_mesh(TETRAHEDRON_MESH, "glb", UP), "NORMAL")
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+    outward = TETRAHEDRON_MESH.vertices - TETRAHEDRON_MESH.vertices.mean(axis=0)
+    assert ((normals * outward).sum(axis=1) > 0).all()
+    flat = read_attribute(encode_mesh(one_triangle([0, 1, 2]), "glb", UP), "NORMAL")
+    np.testing.assert_allclose(flat, np.tile([0, 0, -1], (3, 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize("faces", [([0, 1, 2], [2, 1, 0]), ([0, 0, 1], [2, 2, 2])], ids=["opposite", "no area"])
+def test_normals_that_cancel_out_point_up(faces):
+    normals = read_attribute(encode_mesh(one_triangle(*faces), "glb", UP), "NORMAL")
+    np.testing.assert_array_equal(normals, np.tile(UP, (3, 1)))
+
+
+def test_a_glb_needs_no_other_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    assert encode_mesh(TETRAHEDRON_MESH, "glb", UP)[:4] == b"glTF"
 
 
 @pytest.mark.parametrize("extension", ["ply", "obj"])

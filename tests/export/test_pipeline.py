@@ -561,7 +561,6 @@ def test_a_folder_with_a_file_suffix_is_refused_before_the_bake(plain_file, tmp_
     ("ending", "module", "package"),
     [
         *((ending, "pxr", '"hyrfpack[usd]"') for ending in (".usda", ".usdc", ".usdz")),
-        (".points.glb", "trimesh", "trimesh"),
         ("", "pycolmap", '"hyrfpack[poses]"'),
     ],
 )
@@ -573,7 +572,7 @@ def test_missing_packages_are_reported_before_the_bake(
         export(plain_file, tmp_path / f"a{ending}", colmap=not ending)
 
 
-@pytest.mark.parametrize("name", ["a.mesh.glb", "a.collision.obj"])
+@pytest.mark.parametrize("name", ["a.collision.glb", "a.collision.obj"])
 def test_a_mesh_that_needs_trimesh_is_refused_before_depths_are_rendered(name, plain_file, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(HyrfError, match="pip install trimesh'$"):

@@ -5,6 +5,7 @@ import io
 import numpy as np
 import pytest
 import trimesh
+from glb_arrays import read_attribute, srgb_from_linear
 from scenes import look_at
 
 from hyrfpack.errors import HyrfDataError
@@ -45,11 +46,15 @@ def test_ply_contains_positions_and_colors_in_the_input_axes():
 
 def test_glb_contains_points_with_linear_colors_and_cameras_as_lines():
     splats = grey_splats()
-    scene = load_with_trimesh(encode_points(splats, TEST_CAMERAS, "glb", UP_DIRECTION), "glb")
+    data = encode_points(splats, TEST_CAMERAS, "glb", UP_DIRECTION)
+    scene = load_with_trimesh(data, "glb")
     cloud, lines = scene.geometry["gaussians"], scene.geometry["cameras"]
     assert set(scene.geometry) == {"gaussians", "cameras"}
     np.testing.assert_allclose(cloud.vertices, splats.positions, atol=1e-6)
     np.testing.assert_allclose(cloud.colors[99], [round(255 * ((99 / 255 + 0.055) / 1.055) ** 2.4)] * 3 + [99])
+    colors = read_attribute(data, "COLOR_0")
+    np.testing.assert_array_equal(np.round(255 * srgb_from_linear(colors[:, 0])), np.arange(100))
+    np.testing.assert_allclose(read_attribute(data, "COLOR_0", mesh=1)[0], np.array([255, 106, 0, 255]) / 255)
     assert isinstance(lines, trimesh.path.Path3D)
 
 

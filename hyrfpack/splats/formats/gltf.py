@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import json
 import math
-import struct
 from collections.abc import Iterator
 from operator import index as integer
 from typing import Any
@@ -27,10 +26,25 @@ import numpy as np
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.ops.harmonics import MAX_DEGREE, num_sh_bases
-from hyrfpack.rotations import quaternion_from_matrix, rotation_matrices
+from hyrfpack.rotations import rotation_matrices
 from hyrfpack.splats.formats import spz
 from hyrfpack.splats.formats.hints import NO_HINTS, Hints
 from hyrfpack.splats.formats.validation import build_valid_splats
+from hyrfpack.splats.glb import (
+    BINARY_CHUNK_TYPE,
+    CHUNK_HEADER_STRUCT,
+    DTYPE_BY_COMPONENT_TYPE,
+    GLTF_UP,
+    HEADER_STRUCT,
+    JSON_CHUNK_TYPE,
+    POINTS_MODE,
+    WIDTH_BY_ACCESSOR_TYPE,
+    describe_bounds,
+    describe_placement,
+    linear_from_srgb,
+    pack_arrays,
+    pack_glb,
+)
 from hyrfpack.splats.placement import (
     apply_transform,
     choose_local_origin,
@@ -42,20 +56,10 @@ from hyrfpack.splats.splats import Splats, concatenate
 
 SPLATTING_EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = "KHR_gaussian_splatting_compression_spz_2"
-GLTF_UP = (0.0, 1.0, 0.0)
-_HEADER_STRUCT = struct.Struct("<4sII")
-_CHUNK_HEADER_STRUCT = struct.Struct("<II")
-_JSON_CHUNK_TYPE = 0x4E4F534A
-_BINARY_CHUNK_TYPE = 0x004E4942
-_POINTS_MODE = 0
 _FLOAT_TYPE, _BYTE_TYPE = 5126, 5121
-_ARRAY_BUFFER_TARGET = 34962
-_DTYPE_BY_COMPONENT_TYPE = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5126: np.float32}
-_WIDTH_BY_ACCESSOR_TYPE = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _MAX_NODES = 10_000
 # A file with fewer bytes per splat must refer to the same data repeatedly, and would unpack to far more than its size.
 _MIN_BYTES_PER_SPLAT = 16
-_MAX_FILE_BYTES = (1 << 32) - 1  # because lengths in the file are uint32
 
 
 def encode(splats: Splats, hints: Hints = NO_HINTS) -> bytes:
@@ -83,20 +87,16 @@ def encode_at(splats: Splats, origin: np.ndarray, turn: np.ndarray) -> bytes:
     """
     _check_not_empty(splats)
     attributes = {"POSITION": subtract_origin(splats, origin)}
-    attributes["COLOR_0"] = encode_linear_colors(splats)
+    attributes["COLOR_0"] = _encode_linear_colors(splats)
     attributes[f"{SPLATTING_EXTENSION}:ROTATION"] = splats.quats[:, [1, 2, 3, 0]]
     attributes[f"{SPLATTING_EXTENSION}:SCALE"] = splats.scales
     attributes[f"{SPLATTING_EXTENSION}:OPACITY"] = splats.opacities[:, None]
     for term, semantic in enumerate(_list_harmonics_semantics(splats.degree)):
         attributes[semantic] = splats.harmonics[:, term]
 
-    accessors, views, parts = _pack_attributes(list(attributes.values()))
-    positions = attributes["POSITION"]
-    accessors[0].update(min=positions.min(axis=0).tolist(), max=positions.max(axis=0).tolist())
-    w, x, y, z = quaternion_from_matrix(turn).tolist()
-    node = {"name": "Gaussians", "mesh": 0, "rotation": [x, y, z, w]}
-    if origin.any():
-        node["translation"] = (turn @ origin).tolist()
+    accessors, views, parts = pack_arrays(list(attributes.values()))
+    accessors[0].update(describe_bounds(attributes["POSITION"]))
+    node = {"name": "Gaussians", "mesh": 0, **describe_placement(turn, origin)}
     return _assemble(list(attributes), node, accessors, views, parts)
 
 
@@ -115,10 +115,9 @@ def encode_compressed(splats: Splats) -> tuple[bytes, Splats]:
     """
     _check_not_empty(splats)
     positions = (splats.positions * (1, -1, -1)).astype(np.float32)
-    corners = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
     vector, count = {"componentType": _FLOAT_TYPE, "type": "VEC3"}, {"count": len(splats)}
     accessors: dict[str, dict[str, Any]] = {
-        "POSITION": {**vector, **count, **corners},
+        "POSITION": {**vector, **count, **describe_bounds(positions)},
         "COLOR_0": {"componentType": _BYTE_TYPE, "normalized": True, "type": "VEC4", **count},
         f"{SPLATTING_EXTENSION}:ROTATION": {"componentType": _FLOAT_TYPE, "type": "VEC4", **count},
         f"{SPLATTING_EXTENSION}:SCALE": {**vector, **count},
@@ -169,32 +168,19 @@ def _assemble(
         required = {"extensionsRequired": [SPLATTING_EXTENSION, *compression]}
     primitive = {
         "attributes": {semantic: number for number, semantic in enumerate(semantics)},
-        "mode": _POINTS_MODE,
+        "mode": POINTS_MODE,
         "extensions": {SPLATTING_EXTENSION: splatting},
     }
-    binary, count = sum(map(len, parts)), accessors[0]["count"]
     content = {
-        "asset": {"version": "2.0", "generator": "hyrfpack"},
         "extensionsUsed": [SPLATTING_EXTENSION, *(compression or ())],
         **required,
-        "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [node],
         "meshes": [{"name": "Gaussians", "primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
-        "buffers": [{"byteLength": binary}],
     }
-    text = json.dumps(content, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    length = _HEADER_STRUCT.size + 2 * _CHUNK_HEADER_STRUCT.size + len(text) + binary
-    if length > _MAX_FILE_BYTES:
-        raise HyrfDataError(
-            f"{count:,} Gaussians come to {length:,} bytes and a .glb file holds {_MAX_FILE_BYTES:,}",
-            fix="lower `degree`",
-        )
-    head = _HEADER_STRUCT.pack(b"glTF", 2, length) + _CHUNK_HEADER_STRUCT.pack(len(text), _JSON_CHUNK_TYPE) + text
-    return b"".join((head, _CHUNK_HEADER_STRUCT.pack(binary, _BINARY_CHUNK_TYPE), *parts))
+    return pack_glb(content, parts, fix="lower `degree`")
 
 
 def decode(data: bytes, name: str, *, upright: bool = False) -> Splats:
@@ -240,57 +226,41 @@ def decode(data: bytes, name: str, *, upright: bool = False) -> Splats:
     return concatenate(parts)
 
 
-def _pack_attributes(arrays: list[np.ndarray]) -> tuple[list[dict[str, Any]], list[dict[str, Any]], list[bytes]]:
-    """Return the accessors, buffer views and bytes of arrays (N, width); integers are marked as normalised."""
-    accessors, parts, offset = [], [], 0
-    views: list[dict[str, Any]] = []
-    for values in arrays:
-        kind = next(kind for kind, width in _WIDTH_BY_ACCESSOR_TYPE.items() if width == values.shape[1])
-        component = next(number for number, dtype in _DTYPE_BY_COMPONENT_TYPE.items() if dtype == values.dtype)
-        accessor = {"bufferView": len(views), "componentType": component, "count": len(values), "type": kind}
-        accessors.append({**accessor, "normalized": True} if values.dtype.kind == "u" else accessor)
-        parts.append(values.astype(values.dtype.newbyteorder("<"), copy=False).tobytes())
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(parts[-1]), "target": _ARRAY_BUFFER_TARGET})
-        offset += len(parts[-1])
-    return accessors, views, parts
-
-
 def _list_harmonics_semantics(degree: int) -> list[str]:
     return [
         f"{SPLATTING_EXTENSION}:SH_DEGREE_{band}_COEF_{n}" for band in range(degree + 1) for n in range(2 * band + 1)
     ]
 
 
-def encode_linear_colors(splats: Splats) -> np.ndarray:
-    """Return the colours of degree 0 as linear RGB, as glTF defines COLOR_0, with the opacities: (N, 4) uint8."""
+def _encode_linear_colors(splats: Splats) -> np.ndarray:
+    """Return the colours of degree 0 as linear RGB, as glTF defines COLOR_0, with the opacities: (N, 4) uint8.
+
+    They are only for programs that do not know the extension. Some of these misread 16-bit integers, and float32 would
+    make files of degree 0 a fifth larger.
+    """
     return np.round(255 * np.column_stack((linear_from_srgb(splats.base_colors), splats.opacities))).astype(np.uint8)
-
-
-def linear_from_srgb(srgb: np.ndarray) -> np.ndarray:
-    """Convert sRGB in [0, 1], display-referred, to linear RGB."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def _read_chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
     """Return the parsed JSON and the binary chunk, which is empty if the file has none."""
-    if len(data) < _HEADER_STRUCT.size + _CHUNK_HEADER_STRUCT.size or data[:4] != b"glTF":
+    if len(data) < HEADER_STRUCT.size + CHUNK_HEADER_STRUCT.size or data[:4] != b"glTF":
         raise HyrfDataError(f"{name}: this is not a .glb file", fix="check the path")
-    _, version, length = _HEADER_STRUCT.unpack_from(data)
+    _, version, length = HEADER_STRUCT.unpack_from(data)
     if version != 2 or length != len(data):
         raise HyrfDataError(
             f"{name}: it says version {version} and {length:,} bytes, but version 2 is read and it has {len(data):,}",
             fix="export it again",
         )
     chunks: dict[int, memoryview] = {}
-    offset = _HEADER_STRUCT.size
+    offset = HEADER_STRUCT.size
     while offset < len(data):
-        if offset + _CHUNK_HEADER_STRUCT.size > len(data):
+        if offset + CHUNK_HEADER_STRUCT.size > len(data):
             raise HyrfDataError(
                 f"{name}: it ends within the head of a chunk",
                 fix="the file is damaged, export it again",
             )
-        size, kind = _CHUNK_HEADER_STRUCT.unpack_from(data, offset)
-        offset += _CHUNK_HEADER_STRUCT.size
+        size, kind = CHUNK_HEADER_STRUCT.unpack_from(data, offset)
+        offset += CHUNK_HEADER_STRUCT.size
         if offset + size > len(data):
             raise HyrfDataError(
                 f"{name}: a chunk of {size:,} bytes goes past the end",
@@ -299,7 +269,7 @@ def _read_chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
         chunks.setdefault(kind, memoryview(data)[offset : offset + size])
         offset += size
     try:
-        content = json.loads(bytes(chunks.get(_JSON_CHUNK_TYPE, memoryview(b""))))
+        content = json.loads(bytes(chunks.get(JSON_CHUNK_TYPE, memoryview(b""))))
     except (ValueError, RecursionError) as error:
         raise HyrfDataError(
             f"{name}: its JSON cannot be read ({str(error):.120})",
@@ -307,7 +277,7 @@ def _read_chunks(data: bytes, name: str) -> tuple[dict[str, Any], memoryview]:
         ) from error
     if not isinstance(content, dict):
         raise HyrfDataError(f"{name}: its JSON is not an object", fix="the file is damaged, export it again")
-    return content, chunks.get(_BINARY_CHUNK_TYPE, memoryview(b""))
+    return content, chunks.get(BINARY_CHUNK_TYPE, memoryview(b""))
 
 
 def _find_splat_primitives(content: dict[str, Any], name: str) -> Iterator[tuple[np.ndarray, dict[str, Any]]]:
@@ -386,11 +356,11 @@ def _read_accessor(content: dict[str, Any], binary: memoryview, accessor: dict, 
             f"{name}: only uncompressed data inside the .glb file is supported",
             fix="export it again as one .glb file without compression",
         )
-    dtype = np.dtype(_DTYPE_BY_COMPONENT_TYPE[accessor["componentType"]])
+    dtype = np.dtype(DTYPE_BY_COMPONENT_TYPE[accessor["componentType"]])
     count, size = integer(accessor["count"]), width * dtype.itemsize
     start, length = integer(view.get("byteOffset", 0)), integer(view["byteLength"])
     offset, stride = integer(accessor.get("byteOffset", 0)), integer(view.get("byteStride", size))
-    if _WIDTH_BY_ACCESSOR_TYPE[accessor["type"]] != width:
+    if WIDTH_BY_ACCESSOR_TYPE[accessor["type"]] != width:
         raise HyrfDataError(
             f"{name}: an attribute is {accessor['type']!r:.20}, not of width {width}",
             fix="export it again",
