@@ -33,7 +33,7 @@ from hyrfpack.splats.formats.hints import Hints
 from hyrfpack.splats.names import find_sog_folder, is_splats
 from hyrfpack.splats.splats import Splats
 from hyrfpack.splats.table import ENDINGS_WITH_ORIGIN, FORMATS, SplatFormat
-from hyrfpack.splats.viewpoints import WeightedSplats, sample_viewpoints
+from hyrfpack.splats.viewpoints import WeightedSplats, check_not_empty, sample_viewpoints
 
 _LOG = logging.getLogger(__name__)
 
@@ -96,7 +96,7 @@ def convert_splats(
         context: how progress is shown and the call is stopped.
 
     Raises:
-        HyrfDataError: the source cannot be read, or nothing in it is visible.
+        HyrfDataError: the source cannot be read, or holds no Gaussian that is visible.
         HyrfError: the target is not a format of splats or cannot be written, or the options leave no Gaussian.
 
     Example:
@@ -126,6 +126,7 @@ def _convert(
     """Read, select, write and measure splats."""
     progress(TaskEvent(f"reading {Path(source).name}", 0.0))
     splats = read_splats(source)
+    check_not_empty(splats, str(source))
     cropped = splats if config.crop is None else select_splats(splats, config.crop)
     selected = select_splats(cropped, None, config.min_opacity)
     max_degree = kind.max_degree if config.degree is None else min(kind.max_degree, config.degree)

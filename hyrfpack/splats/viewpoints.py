@@ -68,8 +68,7 @@ class WeightedSplats:
             HyrfDataError: there are no splats, none is visible because each has opacity 0 or no area, or all lie at
                 one place.
         """
-        if not len(splats):
-            raise HyrfDataError(f"{name}: there is no Gaussian in it", fix="name another file")
+        check_not_empty(splats, name)
         sides = np.sort(splats.scales.astype(np.float64), axis=1)
         discs = sides[:, 1] * sides[:, 2]
         areas = splats.opacities * discs
@@ -106,6 +105,12 @@ class WeightedSplats:
         areas, squares = self.areas[::stride][is_near], squares[is_near]
         # A disc with standard deviations a and b and opacity o blocks an area of 2 pi a b o of distant light.
         return stride * float((areas / (2 * squares + areas)).sum())
+
+
+def check_not_empty(splats: Splats, name: str) -> None:
+    """Raise HyrfDataError, with the file's name, if there are no splats."""
+    if not len(splats):
+        raise HyrfDataError(f"{name}: there is no Gaussian in it", fix="name another file")
 
 
 def _compute_quantile_box(

@@ -247,6 +247,15 @@ def test_splats_out_of_a_formats_range_are_refused_before_anything_is_written(tm
     assert not (tmp_path / "a.spz").exists()
 
 
+@pytest.mark.parametrize("config", [None, ConvertConfig(crop=(0, 0, 0, 1, 1, 1))])
+def test_an_empty_file_is_refused_as_such(config, tmp_path):
+    source = write_splats(tmp_path, ".ply", ball_splats(5)[:0])
+    with pytest.raises(HyrfDataError, match=r"before\.ply: there is no Gaussian in it; name another file$"):
+        hyrfpack.convert_splats(source, tmp_path / "a.spz", config)
+    with pytest.raises(HyrfDataError, match=r"before\.ply: there is no Gaussian in it; name another file$"):
+        hyrfpack.import_splats(source, tmp_path / "a.hyrf")
+
+
 def test_invisible_splats_are_refused(tmp_path):
     splats = ball_splats(5)
     unseen = Splats(splats.positions, splats.scales * 0, splats.quats, splats.opacities, splats.harmonics)
