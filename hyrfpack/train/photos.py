@@ -34,11 +34,10 @@ def load_training_scene(model: str | os.PathLike[str]) -> Scene | None:
         (8, 2)
     """
     model = find_model(model)
-    recorded = _read_scene_facts(model)
+    recorded = _read_recorded_photos(model)
     if recorded is None:
         return None
-    reading, sizes = dict(recorded["reading"]), (recorded["train"], recorded["test"])
-    path = reading.pop("path")
+    path, reading, sizes = recorded
     scene = load_scene(path, **reading)
     if sizes != (len(scene.train), len(scene.test)):
         raise HyrfDataError(
@@ -56,14 +55,22 @@ def recorded_split(model: Path, photos: Path) -> dict[str, Any]:
         model: file of a model.
         photos: folder of photos; empty if the model is not that of a run on this folder.
     """
-    recorded = _read_scene_facts(model)
-    if recorded is None or os.path.realpath(recorded["reading"]["path"]) != os.path.realpath(photos):
+    recorded = _read_recorded_photos(model)
+    if recorded is None:
         return {}
-    return {name: recorded["reading"][name] for name in ("test_every", "held_out") if name in recorded["reading"]}
+    path, reading, _ = recorded
+    if os.path.realpath(path) != os.path.realpath(photos):
+        return {}
+    return {name: reading[name] for name in ("test_every", "held_out") if name in reading}
 
 
-def _read_scene_facts(model: Path) -> dict[str, Any] | None:
-    """Return what the folder of a run records about its photos; None if it is no run, or the record is not valid."""
+def _read_recorded_photos(model: Path) -> tuple[str, dict[str, Any], tuple[int, int]] | None:
+    """Read the record of a run's photos beside its model.
+
+    Returns:
+        The path of the photos, the other arguments of `load_scene`, and the numbers of photos to train on and held out;
+        None if the model is not in the folder of a run, or the record is not valid.
+    """
     if model.name != MODEL_FILE:
         return None
     try:
@@ -72,7 +79,9 @@ def _read_scene_facts(model: Path) -> dict[str, Any] | None:
         path = reading.pop("path")
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
-    return recorded if _is_reading(path, reading) and all(type(size) is int for size in sizes) else None
+    if not _is_reading(path, reading) or not all(type(size) is int for size in sizes):
+        return None
+    return path, reading, sizes
 
 
 def _is_reading(path: object, options: dict) -> bool:

@@ -12,6 +12,7 @@ from scenes import QUIET_CONTEXT
 import hyrfpack
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.train import load_training_scene
+from hyrfpack.train.photos import recorded_split
 
 
 @pytest.fixture(scope="module")
@@ -92,3 +93,16 @@ def test_photos_that_are_gone_are_a_clear_error(run, tmp_path):
 def test_photos_that_have_changed_since_are_a_clear_error(run, tmp_path):
     with pytest.raises(HyrfDataError, match="name the photos with `data`"):
         load_training_scene(copy_run_with(run, tmp_path / "run", test_every=2))
+
+
+def test_the_split_of_a_run_holds_for_its_own_photos_only(run, data, tmp_path):
+    assert recorded_split(run / "model.hyrf", data) == {"test_every": 5}
+    assert recorded_split(run / "model.hyrf", tmp_path) == recorded_split(run / "other.hyrf", data) == {}
+
+
+def test_a_reading_that_is_a_list_of_pairs_is_read_or_ignored_like_an_object(run, data, tmp_path):
+    shutil.copytree(run, tmp_path / "copy")
+    metrics = json.loads((run / "metrics.json").read_text())
+    metrics["scene"]["reading"] = list(metrics["scene"]["reading"].items())
+    (tmp_path / "copy" / "metrics.json").write_text(json.dumps(metrics))
+    assert recorded_split(tmp_path / "copy" / "model.hyrf", data) == {"test_every": 5}
