@@ -209,7 +209,7 @@ def explain_disk_errors(out: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if is_disk_full(error):
             raise disk_full_error(out) from error
         if isinstance(error, FileNotFoundError):
             raise HyrfError(
@@ -220,6 +220,11 @@ def explain_disk_errors(out: Path) -> Iterator[None]:
             f"{error.filename or out}: this file or folder cannot be read or written ({error.strerror or error})",
             fix="check the folder's permissions and the disk",
         ) from error
+
+
+def is_disk_full(error: OSError) -> bool:
+    """Return whether an error says that the disk or the user's share of it is full."""
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def disk_full_error(folder: Path) -> HyrfError:

@@ -103,9 +103,9 @@ def read_headers(
     left_out: dict[str, str] = {}
     # Names that faces and rewritten photos must not get. Some file systems ignore letter case.
     taken_names = {path.relative_to(root).as_posix().casefold() for path in files}
-    headers = list(_map_on_threads(_read_facts_or_reason, files, progress, "reading the headers of photos", len(files)))
+    headers = _map_on_threads(_read_facts_or_reason, files, progress, "reading the headers of photos", len(files))
     is_usable = [
-        _shown_name(path) == str(path) and not isinstance(facts, str)
+        _shown_name(path.relative_to(root)) == str(path.relative_to(root)) and not isinstance(facts, str)
         for path, facts in zip(files, headers, strict=True)
     ]
     originals = _find_copies(compress(files, is_usable))

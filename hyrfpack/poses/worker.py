@@ -21,7 +21,7 @@ from typing import Any
 import hyrfpack  # must come first, because it imports zlib before pycolmap  # noqa: F401
 from hyrfpack.errors import HyrfDataError, HyrfError, needs_package
 from hyrfpack.poses.job import Job
-from hyrfpack.poses.output import explain_disk_errors
+from hyrfpack.poses.output import disk_full_error, is_disk_full
 from hyrfpack.progress import Event, TaskEvent
 
 _output_lock = threading.Lock()  # a second thread reports progress during long calls, see `watch`
@@ -65,12 +65,17 @@ def main(job: str, stage: str, *models: str) -> None:
     """Run one stage of a saved job and send its answer."""
     _exit_with_parent()
     try:
-        with explain_disk_errors(Path(job).parent), needs_package("estimating poses"):
+        with needs_package("estimating poses"):
             answer = run(Job.load(Path(job)), stage, list(models))
     except HyrfDataError as error:
         answer = {"refused": [error.problem, error.fix]}
     except HyrfError as error:
         answer = {"failed": [error.problem, error.fix]}
+    except OSError as error:
+        if not is_disk_full(error):
+            raise
+        full = disk_full_error(Path(job).parent)
+        answer = {"failed": [full.problem, full.fix]}
     send_message({"answer": answer})
 
 

@@ -191,7 +191,7 @@ def test_a_full_disk_while_features_are_sought_keeps_the_work(photos_and_poses, 
 
 
 @pytest.mark.integration
-def test_a_process_that_ends_on_a_full_disk_has_an_empty_log(tmp_path, monkeypatch):
+def test_an_empty_log_on_a_full_disk_is_reported_as_a_full_disk(tmp_path, monkeypatch):
     (tmp_path / "features.log").touch()
     assert "ended with code 1" in process._crash_error("features", 1, tmp_path / "features.log").problem
     monkeypatch.setattr(process.shutil, "disk_usage", lambda folder: shutil._ntuple_diskusage(1 << 30, 1 << 30, 4096))
