@@ -16,8 +16,8 @@ import numpy as np
 Item = TypeVar("Item")
 # Largest allowed entry of |R R^T - I|. Text files round poses, so that rotations read from them are not exact.
 RIGID_TOLERANCE = 1e-3
+DEFAULT_TEST_EVERY = 8  # every 8th photo is held out
 # Photos whose longer side has more pixels are shrunk to this length, as in 3DGS.
-DEFAULT_TEST_EVERY = 8
 DEFAULT_MAX_SIZE = 1600
 MIN_MAX_SIZE = 16  # shrunk further, photos show too little to train on; SSIM alone compares windows of 11 pixels
 

@@ -99,7 +99,8 @@ def train_blocks(
         observer: see `hyrfpack.train_model`.
         log: see `hyrfpack.train_model`. The log of a block has its name in the name of the file.
         context: device, processes, progress and stop, see `hyrfpack.train_model`. Several processes train one block
-            each at a time, and need a common file system. Only rank 0 merges and returns metrics. If the launcher
+            each at a time, and need a common file system. Only rank 0 merges and returns metrics, and the model
+            exists only when it has returned. If the launcher
             restarts the processes, they resume.
 
     Raises:

@@ -45,6 +45,7 @@ LEAK_REMEDY = "hold out the same photos as in training, with `test_every`"
 # A stored camera matches a photo's camera that differs from it by no more than these two limits.
 _MAX_MATCH_DISTANCE_SCENE_SCALES = 5 / COARSE_POSE_STEPS_PER_SCENE_SCALE
 _MAX_MATCH_ANGLE_DEGREES = 3.0
+_MIN_LEAK_MARGIN = 0.3  # of the limits above; coarse positions are rounded by up to 0.2 of them
 # With a lower share of matched cameras, the photos are not those of training. The share is above zero because two
 # scenes may have a few cameras in common by chance: the first camera of many scenes stands at the origin.
 _MIN_MATCHED_CAMERA_SHARE = 0.25
@@ -229,19 +230,19 @@ class Capture:
     def leak(self) -> str:
         """The problem if the model was trained on held-out photos of the scene, as far as stored cameras tell, or "".
 
-        A stored camera is that of a held-out photo if it matches it, and differs from all others at least twice as
-        much.
+        A stored camera is that of a held-out photo if it matches it, and differs from all others clearly more than the
+        rounding of coarse cameras explains.
         """
         if self.scene is None or not (self.scene.train and self.scene.test):
             return ""
         held_out, others = map(self._differences_of_stored_cameras, (self.scene.test, self.scene.train))
-        leaked = int(((held_out <= 1) & (held_out < others / 2)).sum())
+        leaked = int(((held_out <= 1) & (held_out < others / 2) & (others - held_out > _MIN_LEAK_MARGIN)).sum())
         if not leaked:
             return ""
         return (
             f"{self.scene.path}: of the {len(held_out)} cameras that the model keeps of its training, {leaked} "
             f"{'are' if leaked > 1 else 'is'} among those of the held-out photos, so the model was trained on some of "
-            "them and its scores are too high"
+            "them, and scores on them are too high"
         )
 
     @property

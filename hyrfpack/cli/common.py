@@ -182,14 +182,18 @@ def read_scene(
     """
     from hyrfpack.cameras.capture import LEAK_REMEDY, MISMATCH_REMEDY, Capture, place_photos
     from hyrfpack.data import load_scene
+    from hyrfpack.scene import DEFAULT_TEST_EVERY
 
     options = {name: value for name, value in reader_options.items() if value is not None}
     if facts is not None:
         options = {"max_size": Capture(facts).max_size, **options}
     if model is not None and "test_every" not in options:
-        from hyrfpack.train.photos import recorded_split
+        from hyrfpack.train.photos import read_recorded_split
 
-        options |= recorded_split(model, path)
+        split = read_recorded_split(model, path, options)
+        if split.get("test_every", DEFAULT_TEST_EVERY) != DEFAULT_TEST_EVERY or "held_out" in split:
+            note(f"the same photos are held out as in the run {model.parent}")
+        options |= split
     scene = load_scene(path, **options)
     for sentence in scene.notes:
         note(sentence)

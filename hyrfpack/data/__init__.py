@@ -124,7 +124,9 @@ def _read(given: Path, top: Path, notes: list[str], reading: dict[str, Any], hel
         try:
             scene = scene.with_held_out(held_out)
         except ValueError as error:
-            raise HyrfDataError(f"{folder}: {error}", fix="name other photos to hold out") from error
+            raise HyrfDataError(
+                f"{folder}: {error}", fix="name other photos to hold out, or choose them with `test_every`"
+            ) from error
         reading["held_out"] = sorted(held_out)
     return replace(scene, files=files, reading={"path": os.path.abspath(given), **reading})
 

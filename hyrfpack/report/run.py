@@ -11,7 +11,7 @@ from typing import Any
 
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.format import describe_file
-from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE
+from hyrfpack.format.run_folder import CHECKPOINT_FILE, METRICS_FILE, MODEL_FILE, advise_on_unfinished_run
 from hyrfpack.outputs import StrPath
 from hyrfpack.render.files import unique_stems
 from hyrfpack.train.results import VIEWS_FOLDER
@@ -104,8 +104,7 @@ def read_run(folder: StrPath) -> Run:
     if (folder / CHECKPOINT_FILE).exists():
         raise HyrfDataError(
             f"{folder}: the run has not finished ({CHECKPOINT_FILE} still exists)",
-            fix="finish it by running its 'hyrfpack train' command again with `resume=True` (instead of "
-            "`overwrite=True`)",
+            fix=advise_on_unfinished_run(folder),
         )
     for name in (METRICS_FILE, MODEL_FILE):
         if not (folder / name).is_file():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,18 +49,24 @@ def load_training_scene(model: str | os.PathLike[str]) -> Scene | None:
     return scene
 
 
-def recorded_split(model: Path, photos: Path) -> dict[str, Any]:
-    """Return the arguments of `load_scene` with which a run held photos out: "test_every", and "held_out" if used.
+def read_recorded_split(model: Path, photos: Path, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Read the arguments of `load_scene` with which a run held photos out.
 
     Args:
         model: file of a model.
-        photos: folder of photos; empty if the model is not that of a run on this folder.
+        photos: folder of photos.
+        options: other arguments of `load_scene` that are given.
+
+    Returns:
+        "test_every", and "held_out" if photos were held out by name; empty if the model is not that of a run on these
+        photos, read with these options.
     """
     recorded = _read_recorded_photos(model)
     if recorded is None:
         return {}
     path, reading, _ = recorded
-    if os.path.realpath(path) != os.path.realpath(photos):
+    is_same = all(options.get(name, reading[name]) == reading[name] for name in ("images", "layout", "model"))
+    if not is_same or os.path.realpath(path) != os.path.realpath(photos):
         return {}
     return {name: reading[name] for name in ("test_every", "held_out") if name in reading}
 
@@ -92,6 +99,10 @@ def _is_reading(path: object, options: dict) -> bool:
     if not isinstance(held_out, list) or not all(isinstance(name, str) for name in held_out):
         return False
     options = {name: value for name, value in options.items() if name != "held_out"}
+    try:
+        os.fsencode(str(path))
+    except UnicodeEncodeError:
+        return False
     if not isinstance(path, str) or "\0" in path or options.keys() != kinds.keys():
         return False
     return (

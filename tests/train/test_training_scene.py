@@ -12,7 +12,7 @@ from scenes import QUIET_CONTEXT
 import hyrfpack
 from hyrfpack.errors import HyrfDataError
 from hyrfpack.train import load_training_scene
-from hyrfpack.train.photos import recorded_split
+from hyrfpack.train.photos import read_recorded_split
 
 
 @pytest.fixture(scope="module")
@@ -96,13 +96,26 @@ def test_photos_that_have_changed_since_are_a_clear_error(run, tmp_path):
 
 
 def test_the_split_of_a_run_holds_for_its_own_photos_only(run, data, tmp_path):
-    assert recorded_split(run / "model.hyrf", data) == {"test_every": 5}
-    assert recorded_split(run / "model.hyrf", tmp_path) == recorded_split(run / "other.hyrf", data) == {}
+    assert read_recorded_split(run / "model.hyrf", data, {}) == {"test_every": 5}
+    assert (
+        read_recorded_split(run / "model.hyrf", tmp_path, {}) == read_recorded_split(run / "other.hyrf", data, {}) == {}
+    )
 
 
-def test_a_reading_that_is_a_list_of_pairs_is_read_or_ignored_like_an_object(run, data, tmp_path):
+def test_the_split_of_a_run_does_not_hold_for_photos_that_are_read_otherwise(run, data):
+    assert read_recorded_split(run / "model.hyrf", data, {"max_size": 30, "images": "images_2"}) == {}
+    assert read_recorded_split(run / "model.hyrf", data, {"layout": "colmap"}) == {}
+    assert read_recorded_split(run / "model.hyrf", data, {"max_size": 30}) == {"test_every": 5}
+
+
+def test_a_path_that_no_file_can_have_is_no_record(run, data, tmp_path):
+    model = copy_run_with(run, tmp_path / "copy", path="\ud800x")
+    assert read_recorded_split(model, data, {}) == {} and load_training_scene(model) is None
+
+
+def test_a_reading_that_is_a_list_of_pairs_is_read_like_an_object(run, data, tmp_path):
     shutil.copytree(run, tmp_path / "copy")
     metrics = json.loads((run / "metrics.json").read_text())
     metrics["scene"]["reading"] = list(metrics["scene"]["reading"].items())
     (tmp_path / "copy" / "metrics.json").write_text(json.dumps(metrics))
-    assert recorded_split(tmp_path / "copy" / "model.hyrf", data) == {"test_every": 5}
+    assert read_recorded_split(tmp_path / "copy" / "model.hyrf", data, {}) == {"test_every": 5}
