@@ -208,9 +208,11 @@ def explain_disk_errors(out: Path) -> Iterator[None]:
     """Convert errors of the disk and of permissions in the block into a HyrfError."""
     try:
         yield
-    except OSError as error:
+    except (HyrfError, OSError) as error:
         if is_disk_full(error):
             raise disk_full_error(out) from error
+        if isinstance(error, HyrfError):
+            raise
         if isinstance(error, FileNotFoundError):
             raise HyrfError(
                 f"{error.filename or out}: this file or folder was removed or moved during the estimation",
@@ -222,9 +224,13 @@ def explain_disk_errors(out: Path) -> Iterator[None]:
         ) from error
 
 
-def is_disk_full(error: OSError) -> bool:
-    """Return whether an error says that the disk or the user's share of it is full."""
-    return error.errno in (errno.ENOSPC, errno.EDQUOT)
+def is_disk_full(error: HyrfError | OSError) -> bool:
+    """Return whether an error, or its cause, says that the disk or the user's share of it is full.
+
+    The error of `atomic` has such a cause. It asks for the bytes of one small file, which are too few to go on.
+    """
+    cause = error.__cause__ if isinstance(error, HyrfError) else error
+    return isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
 def disk_full_error(folder: Path) -> HyrfError:

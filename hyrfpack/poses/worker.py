@@ -69,13 +69,11 @@ def main(job: str, stage: str, *models: str) -> None:
             answer = run(Job.load(Path(job)), stage, list(models))
     except HyrfDataError as error:
         answer = {"refused": [error.problem, error.fix]}
-    except HyrfError as error:
-        answer = {"failed": [error.problem, error.fix]}
-    except OSError as error:
-        if not is_disk_full(error):
+    except (HyrfError, OSError) as error:
+        shown = disk_full_error(Path(job).parent) if is_disk_full(error) else error
+        if not isinstance(shown, HyrfError):
             raise
-        full = disk_full_error(Path(job).parent)
-        answer = {"failed": [full.problem, full.fix]}
+        answer = {"failed": [shown.problem, shown.fix]}
     send_message({"answer": answer})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -15,8 +16,10 @@ import pytest
 from commands import succeeded
 
 import hyrfpack
+from hyrfpack.atomic import write_atomic
 from hyrfpack.context import RunContext
-from hyrfpack.poses import process
+from hyrfpack.poses import process, worker
+from hyrfpack.poses.output import disk_full_error, explain_disk_errors
 from hyrfpack.progress import TaskEvent
 
 REPOSITORY_ROOT = Path(__file__).parents[2]
@@ -188,6 +191,27 @@ def test_a_full_disk_while_features_are_sought_keeps_the_work(photos_and_poses, 
     with pytest.raises(KeyboardInterrupt):
         hyrfpack.estimate_poses(photos_and_poses[0], out, context=stop_at("matching"))
     assert (out / ".poses" / "features.json").exists()
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_small_file_that_meets_a_full_disk_says_how_to_resume(tmp_path, monkeypatch, capsys, number):
+    def write_on_full_disk(*_):
+        raise OSError(number, os.strerror(number))
+
+    def run_stage(*_):
+        write_atomic(tmp_path / "features.json", b"{}")
+
+    monkeypatch.setattr(os, "fsync", write_on_full_disk)
+    with pytest.raises(hyrfpack.HyrfError) as caught, explain_disk_errors(tmp_path):
+        run_stage()
+    expected = disk_full_error(tmp_path)
+    assert str(caught.value) == str(expected)
+    monkeypatch.setattr(worker, "_exit_with_parent", lambda: None)  # it would end the test
+    monkeypatch.setattr(worker.Job, "load", lambda path: None)
+    monkeypatch.setattr(worker, "run", run_stage)
+    worker.main(str(tmp_path / "job.json"), "features")
+    assert json.loads(capsys.readouterr().out)["answer"] == {"failed": [expected.problem, expected.fix]}
 
 
 @pytest.mark.integration
